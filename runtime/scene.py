@@ -1,0 +1,330 @@
+"""A scene: camera, runway, domain of states, and the sizes of the certificate.
+
+A scene file is TOML; `Scene.load` reads it into frozen dataclasses that check themselves on construction. Every fault is a
+`SceneError` that names the key, says what was found and what to do. Axes, signs and pixel coordinates: `runtime.camera`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import tomllib
+import types
+import typing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+STATE_NAMES = ("theta", "x", "y", "z")
+STATE_UNITS = ("rad", "m", "m", "m")
+TILING_TOLERANCE = 1e-9
+"""Largest gap or overlap between neighbouring cells, in the axis's unit, that is read as decimal rounding in the file."""
+
+
+class SceneError(ValueError):
+    """A scene file, or a value in it, that cannot be used. One line: the key, what was found, what to do."""
+
+
+def _demand(holds: bool, key: str, found: object, advice: str) -> None:
+    if not holds:
+        raise SceneError(f"{key}: found {found}; {advice}")
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Pinhole camera without distortion. `principal_point` is (u0, v0) in px, by default the frame's centre."""
+
+    width: int
+    height: int
+    focal_length_m: float
+    pixel_pitch_m: float
+    principal_point: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("width", "height"):
+            _demand(1 <= getattr(self, name) <= 16384, f"camera.{name}", getattr(self, name), "give 1 to 16384 pixels")
+        for name in ("focal_length_m", "pixel_pitch_m"):
+            _demand(getattr(self, name) > 0, f"camera.{name}", getattr(self, name), "give a length above 0")
+
+    @property
+    def focal_px(self) -> float:
+        """F = rho f, the focal length in px."""
+        return self.focal_length_m / self.pixel_pitch_m
+
+    @property
+    def u0(self) -> float:
+        """Column of the principal point, px."""
+        return self.width / 2 if self.principal_point is None else self.principal_point[0]
+
+    @property
+    def v0(self) -> float:
+        """Row of the principal point, px."""
+        return self.height / 2 if self.principal_point is None else self.principal_point[1]
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width), the shape of a frame."""
+        return self.height, self.width
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What the camera model may be off by, plus or minus (theory of Theorem A, assumption on calibration)."""
+
+    roll_rad: float = 0.0
+    yaw_rad: float = 0.0
+    focal_relative: float = 0.0
+    principal_px: float = 0.0
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            _demand(0 <= value < 0.5, f"calibration.{field.name}", value, "give a plus-minus of at least 0 and below 0.5")
+
+    @property
+    def exact(self) -> bool:
+        """True if the camera model is taken to be exact."""
+        return self == Calibration()
+
+
+@dataclass(frozen=True)
+class Marking:
+    """A straight stripe along the runway: from (x_m, 0, start_z_m) to (x_m, 0, start_z_m + length_m)."""
+
+    name: str
+    x_m: float
+    start_z_m: float
+    length_m: float
+
+    def __post_init__(self) -> None:
+        _demand(self.length_m > 0, f"runway.markings {self.name!r} length_m", self.length_m, "give a length above 0")
+
+    @property
+    def ends_z_m(self) -> tuple[float, float]:
+        """p_z of the near and of the far end."""
+        return self.start_z_m, self.start_z_m + self.length_m
+
+
+@dataclass(frozen=True)
+class Runway:
+    """The markings that the camera sees, joined by OR in the image."""
+
+    markings: tuple[Marking, ...]
+
+    def __post_init__(self) -> None:
+        names = [marking.name for marking in self.markings]
+        _demand(len(names) > 0, "runway.markings", "none", "give at least one [[runway.markings]] table")
+        _demand(len(set(names)) == len(names), "runway.markings name", names, "give each marking its own name")
+
+    @property
+    def x_m(self) -> NDArray[np.float64]:
+        """p_x of every marking, (markings,)."""
+        return np.array([marking.x_m for marking in self.markings])
+
+    @property
+    def ends_z_m(self) -> NDArray[np.float64]:
+        """p_z of the near and the far end of every marking, (markings, 2)."""
+        return np.array([marking.ends_z_m for marking in self.markings])
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One axis of the domain, tiled by cells of one width around the given centres; width 0 fixes the axis at its one centre."""
+
+    centres: tuple[float, ...]
+    width: float
+
+    def check(self, key: str) -> None:
+        """Raises `SceneError` unless the cells tile an interval without gap or overlap."""
+        _demand(len(self.centres) > 0, f"{key}.centres", "none", "give at least one centre")
+        _demand(self.width >= 0, f"{key}.width", self.width, "give a width of 0 (fixed axis) or more")
+        if self.width == 0:
+            _demand(len(self.centres) == 1, f"{key}.centres", list(self.centres), "an axis of width 0 has one centre")
+        for left, right in itertools.pairwise(self.centres):
+            gap = right - left - self.width
+            _demand(abs(gap) <= TILING_TOLERANCE, f"{key}.centres", f"{left} and {right}", f"neighbours must lie {self.width} apart")
+
+    @property
+    def edges(self) -> NDArray[np.float64]:
+        """Borders of the cells, (cells + 1,), ascending; neighbours share theirs to the last bit. Two equal ones if fixed."""
+        centres, half = np.array(self.centres), self.width / 2
+        return np.concatenate([centres[:1] - half, (centres[:-1] + centres[1:]) / 2, centres[-1:] + half])
+
+
+@dataclass(frozen=True)
+class Domain:
+    """The states that a certificate speaks of: a box in (theta, x, y, z), tiled by cells."""
+
+    theta_rad: Axis
+    x_m: Axis
+    y_m: Axis
+    z_m: Axis
+
+    def __post_init__(self) -> None:
+        for field, axis in zip(dataclasses.fields(self), self.axes, strict=True):
+            axis.check(f"domain.{field.name}")
+        low, high = self.lower, self.upper
+        _demand(low[0] > -math.pi / 2 and high[0] < math.pi / 2, "domain.theta_rad", [low[0], high[0]], "stay within -pi/2 and pi/2")
+        _demand(low[2] > 0, "domain.y_m", low[2], "the camera must be above the runway: y > 0 throughout")
+
+    @property
+    def axes(self) -> tuple[Axis, Axis, Axis, Axis]:
+        """The four axes in state order."""
+        return self.theta_rad, self.x_m, self.y_m, self.z_m
+
+    @property
+    def lower(self) -> NDArray[np.float64]:
+        """Smallest state of the domain, (4,)."""
+        return np.array([axis.edges[0] for axis in self.axes])
+
+    @property
+    def upper(self) -> NDArray[np.float64]:
+        """Largest state of the domain, (4,)."""
+        return np.array([axis.edges[-1] for axis in self.axes])
+
+    @property
+    def cell_count(self) -> int:
+        """Number of cells."""
+        return math.prod(len(axis.centres) for axis in self.axes)
+
+
+@dataclass(frozen=True)
+class Bank:
+    """How finely `build_model.hough_bank` divides a cell into entries. Finer is tighter, larger and slower; all are sound."""
+
+    pitch_bins: int
+    """Equal bins of theta in a cell."""
+    distance_bins: int
+    """Equal bins of z in a cell."""
+    column_px: float
+    """Largest shift, in px at the reference row, that the states of an entry give the outermost marking through their scale."""
+    lateral_px: float = 0.35
+    """The same through their x; used where the x axis is free."""
+
+    def __post_init__(self) -> None:
+        for name in ("pitch_bins", "distance_bins"):
+            _demand(1 <= getattr(self, name) <= 1000, f"bank.{name}", getattr(self, name), "give a count of 1 to 1000")
+        for name in ("column_px", "lateral_px"):
+            value = getattr(self, name)
+            _demand(0.01 <= value <= 10, f"bank.{name}", value, "give 0.01 to 10 px; below 1 px or no pixel is lit by all of an entry")
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """What a frame may lack or add: see the assumptions of Theorems A and B in `docs/guarantee.md`."""
+
+    line_px: int = 0
+    missed_budget: int = 0
+    extra_budget: int = -1
+
+    def __post_init__(self) -> None:
+        _demand(0 <= self.line_px <= 16, "tolerance.line_px", self.line_px, "give 0 to 16 px")
+        _demand(0 <= self.missed_budget < 2**16, "tolerance.missed_budget", self.missed_budget, "give 0 or more pixels")
+        _demand(-1 <= self.extra_budget < 2**31, "tolerance.extra_budget", self.extra_budget, "give 0 or more pixels, or -1: not used")
+
+
+@dataclass(frozen=True)
+class EstimatorTraining:
+    """How NN_e is trained (`build_model.state_network`): frames made by the supercover, with clutter and missed pixels."""
+
+    training_frames: int = 60_000
+    epochs: int = 12
+    batch: int = 128
+    largest_clutter: float = 0.06
+    """Densities of random clutter are drawn from 0 to this."""
+
+    def __post_init__(self) -> None:
+        for name in ("training_frames", "epochs", "batch"):
+            _demand(getattr(self, name) >= 1, f"estimator.{name}", getattr(self, name), "give a count above 0")
+        _demand(0 <= self.largest_clutter <= 1, "estimator.largest_clutter", self.largest_clutter, "give a share of 0 to 1")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Everything that a model is built from. `to_dict` and `from_dict` carry it through a model's metadata unchanged."""
+
+    camera: Camera
+    runway: Runway
+    domain: Domain
+    bank: Bank
+    calibration: Calibration = Calibration()
+    tolerance: Tolerance = Tolerance()
+    estimator: EstimatorTraining = EstimatorTraining()
+
+    def __post_init__(self) -> None:
+        nearest = self.domain.lower[3] + self.runway.ends_z_m.min()
+        _demand(nearest > 0, "domain.z_m", self.domain.lower[3], "some state has a marking's end beside or behind the camera: z + start_z_m > 0")
+        steepest = math.atan2(self.domain.upper[2], nearest) - self.domain.lower[0]
+        flattest = math.atan2(self.domain.lower[2], self.domain.upper[3] + self.runway.ends_z_m.max()) - self.domain.upper[0]
+        _demand(-math.pi / 2 < flattest and steepest < math.pi / 2, "domain", "a state", "the runway is behind the camera (Z <= 0): narrow theta_rad or z_m")
+
+    @classmethod
+    def load(cls, path: str | Path) -> Scene:
+        """Reads a scene file. Raises `SceneError` for a missing file, bad TOML or a bad value."""
+        try:
+            text = Path(path).read_text(encoding="utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise SceneError(f"{path}: cannot be read ({error}); give the path of a TOML scene file") from error
+        try:
+            return cls.from_dict(tomllib.loads(text))
+        except tomllib.TOMLDecodeError as error:
+            raise SceneError(f"{path}: not TOML ({error})") from error
+        except SceneError as error:
+            raise SceneError(f"{path}: {error}") from error
+
+    @classmethod
+    def from_dict(cls, tables: dict[str, Any]) -> Scene:
+        """A scene from TOML's or JSON's tables. Raises `SceneError`."""
+        return _read(cls, tables, "")
+
+    def to_dict(self) -> dict[str, Any]:
+        """The scene as plain tables; `Scene.from_dict` gives it back."""
+        return _plain(dataclasses.asdict(self))
+
+
+def _plain(value: Any) -> Any:
+    """`value` with tuples as lists and without the absent entries, which TOML cannot write."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items() if item is not None}
+    return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
+
+
+def _read(kind: Any, value: Any, key: str) -> Any:
+    """`value` as `kind`: a dataclass, a tuple, a number or a text. Raises `SceneError` that names `key`."""
+    if dataclasses.is_dataclass(kind):
+        return _read_table(kind, value, key)
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if origin is types.UnionType:
+        return _read(next(part for part in arguments if part is not type(None)), value, key)
+    if origin is tuple:
+        return _read_tuple(arguments, value, key)
+    if kind is float:
+        usable = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        _demand(usable, key, repr(value), "give a finite number")
+        return float(value)
+    usable = isinstance(value, kind) and not (kind is int and isinstance(value, bool))
+    _demand(usable, key, repr(value), f"give {'a whole number' if kind is int else 'a text'}")
+    return value
+
+
+def _read_table(kind: Any, table: Any, key: str) -> Any:
+    _demand(isinstance(table, dict), key or "scene", repr(table), "give a table")
+    hints, fields = typing.get_type_hints(kind), dataclasses.fields(kind)
+    prefix = f"{key}." if key else ""
+    for name in table:
+        _demand(name in hints, f"{prefix}{name}", "an unknown key", f"known here: {', '.join(hints)}")
+    for field in fields:
+        optional = field.default is not dataclasses.MISSING
+        _demand(optional or field.name in table, f"{prefix}{field.name}", "nothing", "this key is required")
+    return kind(**{name: _read(hints[name], value, f"{prefix}{name}") for name, value in table.items()})
+
+
+def _read_tuple(kinds: tuple[Any, ...], value: Any, key: str) -> tuple[Any, ...]:
+    _demand(isinstance(value, list), key, repr(value), "give a list")
+    if kinds[-1] is not Ellipsis:
+        _demand(len(value) == len(kinds), key, value, f"give {len(kinds)} values")
+    return tuple(_read(kinds[0], item, f"{key}[{position}]") for position, item in enumerate(value))
