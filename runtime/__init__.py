@@ -1,0 +1,13 @@
+"""Certified vision-based state estimation of landing aircraft: the embedded runtime. Needs numpy and onnxruntime only.
+
+    estimator = Estimator.load()
+    estimate = estimator.estimate(frame)
+
+Conventions: `runtime.camera`. What is guaranteed: `runtime.estimator` and docs/guarantee.md.
+"""
+
+from runtime.estimator import Box, Estimate, Estimator, FrameError, Outcome
+from runtime.model_file import ModelError
+from runtime.scene import Scene, SceneError
+
+__all__ = ["Box", "Estimate", "Estimator", "FrameError", "ModelError", "Outcome", "Scene", "SceneError"]

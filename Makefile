@@ -1,0 +1,44 @@
+# Everything runs from .venv, with the versions that constraints.txt pins. `make setup` alone fills it.
+#
+# PyPI's torch brings several GB of CUDA libraries. To take a CPU wheel from an index or a folder of your own:
+#     make setup PIP_EXTRA='--extra-index-url URL'      or      make setup PIP_EXTRA='--find-links FOLDER'
+
+PYTHON ?= python3
+PIP_EXTRA ?=
+BIN := .venv/bin
+INSTALLED := .venv/installed
+SOURCES := $(wildcard build_model/*.py runtime/*.py)
+
+.PHONY: setup test lint types demo evidence clean
+.DELETE_ON_ERROR:
+
+setup: $(INSTALLED)
+
+$(INSTALLED): pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet $(PIP_EXTRA) --constraint constraints.txt --editable '.[dev]'
+	touch $@
+
+test: lint types
+	$(BIN)/python -m pytest
+
+lint: $(INSTALLED)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(INSTALLED)
+	$(BIN)/pyright
+
+demo: out/paper.onnx
+	$(BIN)/python scripts/fly_approach.py $<
+
+out/paper.onnx: models/paper.toml constraints.txt $(SOURCES) | $(INSTALLED)
+	mkdir -p $(@D)
+	$(BIN)/export-model $< -o $@
+
+evidence: out/paper.onnx
+	$(BIN)/python scripts/coverage.py $< --long
+
+clean:
+	rm -rf .venv out dist build .pytest_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,163 @@
+"""NN_F, the filter of all cells (paper, section III.D): its tables, and a torch module that evaluates it as it is defined.
+
+`FilterTables` lays the cells' banks out side by side, padded to one number of entries a cell, ready for the static graph of
+`build_model.filter_graph`. `FilterNetwork` evaluates S, K and O as dense 0/1 weights instead: spatial masks by elementwise products,
+banks by integer matrix products, an argmax over the cells. The two share no index, so that their parity is a test of both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from build_model.hough_bank import CellBank
+from build_model.partition import Partition, partition
+from build_model.pixel_mask import Runs, Window
+from build_model.rounding import float32_above, float32_below
+from runtime.scene import Scene
+
+NEVER = 2**20
+"""|K| of the padding: more than any frame can light, so that padding never passes and is never the least mismatch."""
+
+
+@dataclass(frozen=True)
+class RunTable:
+    """Masks as look-ups into sums down the columns: mask e has sum over k of sums[stop[k, e]] - sums[start[k, e]] lit pixels.
+
+    Both (runs, masks) int32, flat indices into the (rows + 1, columns) sums of the window; unused ones are 0 in both.
+    """
+
+    start: NDArray[np.int32]
+    stop: NDArray[np.int32]
+
+
+@dataclass(frozen=True)
+class FilterTables:
+    """Constants of NN_F. `entries` is the number of entries of the largest cell, to which every cell is padded."""
+
+    window: Window
+    cells: Partition
+    entries: int
+    spatial: RunTable
+    must_light: RunTable
+    may_light: RunTable
+    must_light_size: NDArray[np.int32]
+    """|K_ij|, (cells, entries); `NEVER` in the padding."""
+    state_lower: NDArray[np.float32]
+    state_upper: NDArray[np.float32]
+    """Each entry in state coordinates, (cells, entries, 4)."""
+    line_lower: NDArray[np.float64]
+    line_upper: NDArray[np.float64]
+    """Each entry's box in theta, x, scale, z, (cells, entries, 4): what a verifier must prove the masks for."""
+    reference_row: NDArray[np.float64]
+    """The row that each entry's scale refers to, (cells, entries) px."""
+
+    @property
+    def smallest_must_light(self) -> int:
+        """Smallest |K_ij| of all entries."""
+        return int(self.must_light_size.min())
+
+
+def assemble(scene: Scene, banks: Sequence[CellBank]) -> FilterTables:
+    """Lays out the banks of all cells, in the order of the partition."""
+    window = banks[0].window
+    for bank in banks[1:]:
+        window = window.union(bank.window)
+    entries = max(len(bank) for bank in banks)
+
+    def padded(parts: Iterable[NDArray], padding: int = 0) -> NDArray:
+        return np.stack([np.pad(part, [(0, entries - len(part))] + [(0, 0)] * (part.ndim - 1), constant_values=padding) for part in parts])
+
+    return FilterTables(
+        window=window,
+        cells=partition(scene),
+        entries=entries,
+        spatial=_run_table([bank.spatial for bank in banks], 1, window),
+        must_light=_run_table([bank.must_light for bank in banks], entries, window),
+        may_light=_run_table([bank.may_light for bank in banks], entries, window),
+        must_light_size=padded((bank.must_light_sizes for bank in banks), NEVER).astype(np.int32),
+        state_lower=padded(bank.state_lower for bank in banks),
+        state_upper=padded(bank.state_upper for bank in banks),
+        line_lower=padded(bank.lines.lower for bank in banks),
+        line_upper=padded(bank.lines.upper for bank in banks),
+        reference_row=padded(bank.lines.reference_row for bank in banks),
+    )
+
+
+def _run_table(runs: Sequence[Runs], masks_per_cell: int, window: Window) -> RunTable:
+    mask = np.concatenate([part.mask + cell * masks_per_cell for cell, part in enumerate(runs)])
+    column, start, stop = (np.concatenate([getattr(part, name) for part in runs]) for name in ("column", "start", "stop"))
+    rank = np.arange(len(mask)) - np.searchsorted(mask, mask)
+    tables = np.zeros((2, rank.max() + 1, len(runs) * masks_per_cell), dtype=np.int32)
+    across = window.right - window.left
+    tables[0, rank, mask] = (start - window.top) * across + column - window.left
+    tables[1, rank, mask] = (stop - window.top) * across + column - window.left
+    return RunTable(*tables)
+
+
+class FilterNetwork(nn.Module):
+    """NN_F in torch, as it is defined; slow and exact. Outputs as in `models/README.md`, without `network_state`."""
+
+    def __init__(self, scene: Scene, banks: Sequence[CellBank]) -> None:
+        super().__init__()
+        self.scene = scene
+        self.banks = banks
+        cells = partition(scene)
+        self.cell_lower = torch.from_numpy(float32_below(cells.lower))
+        self.cell_upper = torch.from_numpy(float32_above(cells.upper))
+
+    def forward(self, frame: Tensor, missed_budget: int, extra_budget: int) -> dict[str, Tensor]:
+        """`frame`: uint8 (height, width) of {0, 1}."""
+        witnessed = self._dilated(frame)
+        support, mismatch, lowers, uppers, masks = [], [], [], [], []
+        for cell, bank in enumerate(self.banks):
+            missed, extra, spatial = self._scores(bank, frame, witnessed)
+            passes = (missed <= missed_budget) & ((extra <= extra_budget) | (extra_budget < 0))
+            support.append(passes.sum(dtype=torch.int32))
+            mismatch.append((missed + extra).min())
+            lowers.append(self._hull(bank.state_lower, passes, self.cell_lower[cell], torch.amin))
+            uppers.append(self._hull(bank.state_upper, passes, self.cell_upper[cell], torch.amax))
+            masks.append(spatial)
+        counts, mismatches = torch.stack(support), torch.stack(mismatch)
+        cell = counts.argmax() if bool(counts.any()) else mismatches.argmin()
+        chosen = counts > 0 if bool(counts.any()) else torch.arange(len(counts)) == cell
+        union = torch.stack(masks)[chosen].any(dim=0)
+        return {
+            "cell": cell,
+            "support": counts,
+            "mismatch": mismatches,
+            "cell_lower": torch.stack(lowers),
+            "cell_upper": torch.stack(uppers),
+            "filtered": frame * union.to(torch.uint8),
+        }
+
+    def _dilated(self, frame: Tensor) -> Tensor:
+        """The frame dilated by the tolerance in the sup norm: a pixel's witnesses."""
+        span = 2 * self.scene.tolerance.line_px + 1
+        wide = frame[None, None].to(torch.float32)
+        return nn.functional.max_pool2d(wide, span, stride=1, padding=span // 2)[0, 0].to(torch.uint8)
+
+    def _scores(self, bank: CellBank, frame: Tensor, witnessed: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """missed and extra of every entry, int32 (entries,), and S in the whole frame."""
+        spatial, must, may = (
+            torch.from_numpy(runs.bits(masks, bank.window)).flatten(1).to(torch.int32)
+            for runs, masks in ((bank.spatial, 1), (bank.must_light, len(bank)), (bank.may_light, len(bank)))
+        )
+        pixels, witnesses = (image[bank.window.slices].flatten().to(torch.int32) for image in (frame, witnessed))
+        missed = must.sum(dim=1, dtype=torch.int32) - must @ witnesses
+        extra = (spatial * (1 - may)) @ pixels
+        mask = torch.zeros(frame.shape, dtype=torch.bool)
+        mask[bank.window.slices] = spatial.reshape(bank.window.shape) > 0
+        return missed, extra, mask
+
+    @staticmethod
+    def _hull(bounds: NDArray[np.float32], passes: Tensor, cell_bound: Tensor, extreme: Callable[..., Tensor]) -> Tensor:
+        """Hull of the passing entries' boxes on one side; the cell's own bound where none passes."""
+        if not bool(passes.any()):
+            return cell_bound
+        return extreme(torch.from_numpy(bounds)[passes], dim=0)

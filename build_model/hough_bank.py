@@ -1,0 +1,147 @@
+"""The bank of a cell: entries B_ij that cover it, each with an outer mask O_ij and an inner mask K_ij (paper, section III.C).
+
+An entry is the set of states of the cell whose line coordinates lie in a stored box. Line coordinates are (theta, x, scale, z):
+theta fixes the row in which all markings' lines vanish, and the scale (px per metre of the ground at a reference row) and x fix
+where each crosses that row; z places the ends. In place of the paper's infinite lines R(rho_j, theta_j), which no segment can
+match, an entry carries
+
+    O_ij  contains every pixel that some state of B_ij lights
+    K_ij  contains only pixels that every state of B_ij lights
+
+so that missed_ij(I) = |K_ij without I| and extra_ij(I) = |(I and S_i) without O_ij| bound what Theorems A and B speak of.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from build_model.enclosure import (
+    StateSet,
+    columns_that_may_be_lit,
+    columns_that_must_be_lit,
+    contract,
+    scale_range,
+)
+from build_model.pixel_mask import Runs, Window, clip_and_widen, paint, runs_of
+from build_model.rounding import float32_above, float32_below, inverted
+from build_model.spatial_filter import reference_row, sliced, spatial_filter
+from runtime.scene import Scene, SceneError
+
+SCALE_STEP = 2.0**-10
+"""Bins of the scale have borders on multiples of this, px per metre, so that they do not depend on the machine's libm."""
+SMALLEST_LEVER_M = 1e-3
+"""A marking's distance from the camera's vertical plane counts as at least this when the bins of the scale are sized."""
+
+
+@dataclass(frozen=True)
+class LineBoxes:
+    """Entries as boxes in line coordinates: `lower` and `upper` (entries, 4) hold theta, x, scale, z; `reference_row` (entries,) px.
+
+    An entry is the set of states of its cell inside its box.
+    """
+
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    reference_row: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.lower)
+
+    def states(self, cell_lower: NDArray[np.float64], cell_upper: NDArray[np.float64]) -> StateSet:
+        """The entries of the cell [cell_lower, cell_upper], (4,) each, as sets of states, not yet contracted."""
+        theta, x, scale, z = (np.stack([self.lower[:, axis], self.upper[:, axis]], axis=-1) for axis in range(4))
+        y = np.broadcast_to([cell_lower[2], cell_upper[2]], theta.shape)
+        return StateSet(theta, x, y, z, scale, self.reference_row)
+
+
+@dataclass(frozen=True)
+class CellBank:
+    """One cell's share of NN_F.
+
+    `spatial` is S_i (one mask), `must_light` and `may_light` are K_ij and O_ij, one mask an entry. `state_lower` and
+    `state_upper` (entries, 4) float32 hold each entry in state coordinates, rounded outward.
+    """
+
+    lines: LineBoxes
+    spatial: Runs
+    must_light: Runs
+    may_light: Runs
+    window: Window
+    state_lower: NDArray[np.float32]
+    state_upper: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    @property
+    def must_light_sizes(self) -> NDArray[np.int64]:
+        """|K_ij| of every entry, (entries,)."""
+        return self.must_light.sizes(len(self))
+
+
+def line_boxes(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> LineBoxes:
+    """Boxes that together cover the cell [lower, upper], both (4,): equal bins of theta, z and x, and of the scale as fine as needed."""
+    bank = scene.bank
+    boxes = []
+    for theta, z in itertools.product(sliced(lower[0], upper[0], bank.pitch_bins), sliced(lower[3], upper[3], bank.distance_bins)):
+        low, high = lower.copy(), upper.copy()
+        (low[0], high[0]), (low[3], high[3]) = theta, z
+        row = reference_row(scene.camera, low, high, scene.runway.ends_z_m.mean())
+        scale = np.array(scale_range(scene.camera, theta, np.array([lower[2], upper[2]]), np.array(row)))
+        lateral_bins = max(1, math.ceil((upper[1] - lower[1]) * scale[1] / bank.lateral_px))
+        for x in sliced(lower[1], upper[1], lateral_bins):
+            boxes += [(theta, x, bin_, z, row) for bin_ in _scale_bins(scene, x, scale)]
+    sides = np.array([[theta, x, scale, z] for theta, x, scale, z, _ in boxes])
+    return LineBoxes(sides[:, :, 0], sides[:, :, 1], np.array([row for *_, row in boxes]))
+
+
+def _scale_bins(scene: Scene, x: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Intervals of the scale that cover `scale` (2,), each moving the outermost marking by at most `column_px`: (bins, 2)."""
+    lever_m = max(np.abs(scene.runway.x_m[:, None] - x).max(), SMALLEST_LEVER_M)
+    step = max(math.floor(scene.bank.column_px / lever_m / SCALE_STEP), 1) * SCALE_STEP
+    edges = np.arange(math.floor(scale[0] / step), math.ceil(scale[1] / step) + 1) * step
+    return np.stack([edges[:-1], edges[1:]], axis=-1)
+
+
+def cell_bank(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> CellBank:
+    """S, entries, O and K of the cell [lower, upper], both (4,).
+
+    Boxes without a state of the cell are dropped, if proved so. Raises `SceneError` where an entry would have |K| <= missed_budget:
+    it would pass on any frame.
+    """
+    lines = line_boxes(scene, lower, upper)
+    states = contract(scene.camera, lines.states(lower, upper))
+    kept = ~(inverted(*states.theta.T) | inverted(*states.y.T))
+    lines, states = LineBoxes(lines.lower[kept], lines.upper[kept], lines.reference_row[kept]), states[kept]
+    spatial, window = spatial_filter(scene, lower, upper)
+    widen_px = scene.tolerance.line_px
+    may_light = paint(clip_and_widen(scene, columns_that_may_be_lit(scene, states), widen_px), window) & spatial
+    must_light = paint(clip_and_widen(scene, columns_that_must_be_lit(scene, states), -widen_px), window)
+    bank = CellBank(
+        lines=lines,
+        spatial=runs_of(spatial[None], window),
+        must_light=runs_of(must_light, window),
+        may_light=runs_of(may_light, window),
+        window=window,
+        state_lower=float32_below(states.lower),
+        state_upper=float32_above(states.upper),
+    )
+    _check_must_light(scene, bank, states)
+    return bank
+
+
+def _check_must_light(scene: Scene, bank: CellBank, states: StateSet) -> None:
+    sizes = bank.must_light_sizes
+    weakest = int(sizes.argmin())
+    if sizes[weakest] <= scene.tolerance.missed_budget:
+        low, high = states.lower[weakest], states.upper[weakest]
+        where = ", ".join(f"{name} {a:.4g}..{b:.4g}" for name, a, b in zip("θxyz", low, high, strict=True))
+        raise SceneError(
+            f"bank: an entry ({where}) has only {sizes[weakest]} pixels that all of its states light, which does not exceed "
+            f"missed_budget {scene.tolerance.missed_budget}; keep the runway in view there, or make the bank finer"
+        )

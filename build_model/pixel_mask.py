@@ -1,0 +1,116 @@
+"""Sets of pixels: from columns a row to bits in a window, and from bits to runs.
+
+A marking that is steeper than 45 degrees in the image covers each column in a single run of rows, and a mask is a few such runs.
+With sums of the frame down its columns, a mask's lit pixels are counted by two look-ups a run (`build_model.filter_network`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from build_model.enclosure import Columns
+from runtime.scene import Scene
+
+Bits = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Window:
+    """A rectangle of the frame: rows [top, bottom) and columns [left, right)."""
+
+    top: int
+    bottom: int
+    left: int
+    right: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns)."""
+        return self.bottom - self.top, self.right - self.left
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Selects the window from a frame."""
+        return slice(self.top, self.bottom), slice(self.left, self.right)
+
+    def union(self, other: Window) -> Window:
+        """The smallest window that holds both."""
+        return Window(
+            min(self.top, other.top), max(self.bottom, other.bottom), min(self.left, other.left), max(self.right, other.right)
+        )
+
+
+@dataclass(frozen=True)
+class Runs:
+    """Masks as vertical runs: mask `mask[k]` holds rows [start[k], stop[k]) of column `column[k]`. Sorted by mask."""
+
+    mask: NDArray[np.int64]
+    column: NDArray[np.int64]
+    start: NDArray[np.int64]
+    stop: NDArray[np.int64]
+
+    def bits(self, masks: int, window: Window) -> Bits:
+        """The masks as bits, (masks, rows, columns) of the window, which must hold them."""
+        rows, columns = window.shape
+        steps = np.zeros((masks, rows + 1, columns), dtype=np.int8)
+        steps[self.mask, self.start - window.top, self.column - window.left] = 1
+        np.subtract.at(steps, (self.mask, self.stop - window.top, self.column - window.left), 1)
+        return np.cumsum(steps, axis=1, dtype=np.int8)[:, :-1].astype(bool)
+
+    def sizes(self, masks: int) -> NDArray[np.int64]:
+        """Pixels of each mask, (masks,)."""
+        return np.bincount(self.mask, weights=self.stop - self.start, minlength=masks).astype(np.int64)
+
+
+def clip_and_widen(scene: Scene, columns: Columns, widen_px: int) -> Columns:
+    """Columns widened by `widen_px` pixels in the sup norm, then clipped to the frame. `widen_px` < 0 keeps off the frame's border.
+
+    Rows of a marking touch each other, so the widened mask is again one run of columns a row.
+    """
+    first, last = columns
+    height, width = scene.camera.shape
+    inset = max(-widen_px, 0)
+    if widen_px > 0:
+        empty = last < first
+        first, last = np.where(empty, width, first - widen_px), np.where(empty, -1, last + widen_px)
+        padding = ((0, 0), (0, 0), (widen_px, widen_px))
+        span = 2 * widen_px + 1
+        first = np.lib.stride_tricks.sliding_window_view(np.pad(first, padding, constant_values=width), span, axis=2).min(-1)
+        last = np.lib.stride_tricks.sliding_window_view(np.pad(last, padding, constant_values=-1), span, axis=2).max(-1)
+    first, last = np.maximum(first, inset), np.minimum(last, width - 1 - inset)
+    rows = np.arange(height)
+    outside = (rows < inset) | (rows >= height - inset) | (last < first)
+    return np.where(outside, width, first), np.where(outside, -1, last)
+
+
+def window_of(columns: Columns) -> Window:
+    """The smallest window that holds the columns; 0 by 0 if there are none."""
+    first, last = columns
+    rows = np.flatnonzero((first <= last).any(axis=(0, 1)))
+    if len(rows) == 0:
+        return Window(0, 0, 0, 0)
+    return Window(int(rows[0]), int(rows[-1]) + 1, int(first.min()), int(last.max()) + 1)
+
+
+def paint(columns: Columns, window: Window) -> Bits:
+    """All markings of each set joined by OR, as bits in the window: (sets, rows, columns)."""
+    first, last = (part[:, :, window.top : window.bottom, None] for part in columns)
+    across = np.arange(window.left, window.right)
+    bits = np.zeros((len(first), *window.shape), dtype=bool)
+    for marking in range(first.shape[1]):
+        bits |= (across >= first[:, marking]) & (across <= last[:, marking])
+    return bits
+
+
+def runs_of(bits: Bits, window: Window) -> Runs:
+    """The vertical runs of masks given as bits (masks, rows, columns) in a window."""
+    upright = np.swapaxes(bits, 1, 2)
+    padded = np.zeros((*upright.shape[:2], upright.shape[2] + 2), dtype=np.int8)
+    padded[:, :, 1:-1] = upright
+    steps = np.diff(padded, axis=2)
+    mask, column, start = np.nonzero(steps == 1)
+    stop = np.nonzero(steps == -1)[2]
+    return Runs(mask, column + window.left, start + window.top, stop + window.top)

@@ -1,0 +1,237 @@
+"""The embedded estimator: event frame in, certified box and state out (paper, Eq. (8)).
+
+    xi-hat = NN_e(NN_F(I))  if it lies in Xi-hat,  else  centre(Xi-hat)
+
+Xi-hat is the hull of the cells whose bank passes. By Theorem A it contains the aircraft's state whatever the clutter, if the state
+lies in the scene's domain, the camera is the scene's (no roll or yaw, the calibration as stated, up to the tolerance), and at most
+`missed_budget` pixels of the runway's image are dark (up to the tolerance).
+"""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+from numpy.typing import ArrayLike, NDArray
+
+from runtime.model_file import ModelError, ModelFile, parse_model
+from runtime.scene import STATE_NAMES, Scene, SceneError
+
+PACKAGED_MODELS = (Path(__file__).parent / "models", Path(__file__).parents[1] / "models")
+"""Where the paper's model lies: in a wheel beside this file, in a checkout at the top."""
+LOG_ERRORS_ONLY = 3
+OUTPUTS = ("cell", "support", "mismatch", "cell_lower", "cell_upper", "filtered", "network_state")
+
+
+class FrameError(ValueError):
+    """A frame that the model cannot take."""
+
+    def __init__(self, actual: str, expected: str) -> None:
+        super().__init__(f"frame: found {actual}, expected {expected}")
+        self.actual = actual
+        self.expected = expected
+
+
+class Outcome(enum.Enum):
+    """What a frame says: CERTIFIED, a box is given; NO_RUNWAY, no state of the domain is consistent with it."""
+
+    CERTIFIED = "certified"
+    NO_RUNWAY = "no runway"
+
+
+@dataclass(frozen=True)
+class Box:
+    """Certified: the state lies between `lower` and `upper`, (4,) float64 each, read-only, under the model's assumptions."""
+
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        for name in ("lower", "upper"):
+            side = np.array(getattr(self, name), dtype=np.float64)
+            side.flags.writeable = False
+            object.__setattr__(self, name, side)
+        if self.lower.shape != (4,) or not (np.isfinite(self.lower) & np.isfinite(self.upper) & (self.lower <= self.upper)).all():
+            raise ValueError(f"box: found lower {self.lower} and upper {self.upper}, expected four finite ordered bounds")
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """Middle of the box, (4,); exact on an axis of width 0."""
+        return np.clip((self.lower + self.upper) / 2, self.lower, self.upper)
+
+    @property
+    def half_widths(self) -> NDArray[np.float64]:
+        """Half of the box's extent, (4,)."""
+        return (self.upper - self.lower) / 2
+
+    def contains(self, state: ArrayLike) -> bool:
+        """True if a state (4,) lies in the box, borders included; False if it has a NaN."""
+        point = np.asarray(state, dtype=np.float64)
+        return bool(((self.lower <= point) & (point <= self.upper)).all())
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What one frame tells. States are [theta, x, y, z] in rad and m (`runtime.camera`)."""
+
+    outcome: Outcome
+    box: Box | None
+    """Certified; None where nothing is."""
+    state: NDArray[np.float64] | None
+    """The proposal if it lies in the box, else the box's centre; None where nothing is certified."""
+    used_fallback: bool
+    """True if the centre was taken."""
+    network_state: NDArray[np.float64]
+    """NN_e's answer, uncertified."""
+    cell: int
+    """The cell with the most consistent entries, or with the smallest mismatch where none is consistent."""
+    passing: NDArray[np.int64]
+    """Numbers of the cells that are consistent with the frame."""
+    mismatch: int
+    """Smallest missed + extra of `cell`."""
+    filtered: NDArray[np.uint8]
+    """The frame within the spatial masks of the passing cells: keeps every lit pixel of the runway."""
+    touches_boundary: bool
+    """The box reaches a face of the domain: it holds the state only if the aircraft is in the domain."""
+
+    @property
+    def certified(self) -> bool:
+        """True if a box is given."""
+        return self.outcome is Outcome.CERTIFIED
+
+
+class Estimator:
+    """A loaded model. Not thread-safe; give each thread its own."""
+
+    def __init__(self, model: ModelFile, name: str, threads: int, missed_budget: int | None, extra_budget: int | None) -> None:
+        self.metadata: dict[str, Any] = model.metadata
+        self.sha256 = model.sha256
+        try:
+            self.scene = Scene.from_dict(model.metadata.get("scene"))
+        except SceneError as error:
+            raise ModelError(f"{name}: the scene in its metadata is unusable ({error})") from error
+        self._budgets = self._checked_budgets(name, missed_budget, extra_budget)
+        self._session = self._open(model.content, name, threads)
+        self._domain_lower, self._domain_upper = self.scene.domain.lower, self.scene.domain.upper
+        self._fixed = self._domain_lower == self._domain_upper
+
+    @classmethod
+    def load(
+        cls,
+        path: str | Path | None = None,
+        *,
+        threads: int = 1,
+        missed_budget: int | None = None,
+        extra_budget: int | None = None,
+        sha256: str | None = None,
+    ) -> Estimator:
+        """Reads a model file; without a path, the paper's model that comes with the package.
+
+        `missed_budget` and `extra_budget` replace the scene's. `sha256` is the digest of the file that the caller trusts. Raises
+        `ModelError` for a file that is missing, not ours, damaged or of another version, and for a budget that it cannot keep.
+        """
+        source = _packaged_model() if path is None else Path(path)
+        try:
+            content = source.read_bytes()
+        except OSError as error:
+            raise ModelError(f"{source}: cannot be read ({error.strerror}); give the path of a model that export-model wrote") from error
+        model = parse_model(content, str(source))
+        if sha256 is not None and sha256.lower() != model.sha256:
+            raise ModelError(f"{source}: sha256 is {model.sha256}, the caller trusts {sha256}; take the file from its source again")
+        return cls(model, str(source), threads, missed_budget, extra_budget)
+
+    def estimate(self, frame: NDArray, proposal: ArrayLike | None = None) -> Estimate:
+        """State and certified box of one frame.
+
+        `frame`: (height, width), bool, or uint8 of {0, 1}. `proposal`: a state (4,) from elsewhere to be checked in place of NN_e's.
+        Raises `FrameError` for any other frame and ValueError for a proposal of another shape.
+        """
+        results = self._session.run(OUTPUTS, {"frame": self._checked_frame(frame), **self._budgets})
+        cell, support, mismatch, cell_lower, cell_upper, filtered, network_state = results
+        network = np.where(self._fixed, self._domain_lower, network_state)
+        passing = np.flatnonzero(support)
+        box = self._hull(cell_lower[passing], cell_upper[passing]) if len(passing) else None
+        state, used_fallback = self._shielded(box, network if proposal is None else self._checked_proposal(proposal))
+        return Estimate(
+            outcome=Outcome.NO_RUNWAY if box is None else Outcome.CERTIFIED,
+            box=box,
+            state=state,
+            used_fallback=used_fallback,
+            network_state=network,
+            cell=int(cell),
+            passing=passing,
+            mismatch=int(mismatch[cell]),
+            filtered=filtered,
+            touches_boundary=box is not None and self._touches_boundary(box),
+        )
+
+    def _hull(self, lower: NDArray[np.float32], upper: NDArray[np.float32]) -> Box:
+        """Hull of the passing cells' boxes within the domain, which holds the state by assumption."""
+        low, high = lower.min(axis=0).astype(np.float64), upper.max(axis=0).astype(np.float64)
+        return Box(np.maximum(low, self._domain_lower), np.minimum(high, self._domain_upper))
+
+    @staticmethod
+    def _shielded(box: Box | None, proposal: NDArray[np.float64]) -> tuple[NDArray[np.float64] | None, bool]:
+        """The paper's Eq. (8): the proposal if it lies in the box, else the box's centre; and whether the centre was taken."""
+        if box is None:
+            return None, False
+        return (proposal, False) if box.contains(proposal) else (box.centre, True)
+
+    def _touches_boundary(self, box: Box) -> bool:
+        touches = (box.lower <= self._domain_lower) | (box.upper >= self._domain_upper)
+        return bool((touches & ~self._fixed).any())
+
+    def _checked_frame(self, frame: NDArray) -> NDArray[np.uint8]:
+        expected = f"an array {self.scene.camera.shape} of bool, or of uint8 0 and 1"
+        if not isinstance(frame, np.ndarray):
+            raise FrameError(type(frame).__name__, expected)
+        if frame.shape != self.scene.camera.shape or frame.dtype not in (np.bool_, np.uint8):
+            raise FrameError(f"{frame.shape} of {frame.dtype}", expected)
+        pixels = np.ascontiguousarray(frame).view(np.uint8)
+        largest = int(pixels.max())
+        if largest > 1:
+            raise FrameError(f"a value of {largest}", expected)
+        return pixels
+
+    @staticmethod
+    def _checked_proposal(proposal: ArrayLike) -> NDArray[np.float64]:
+        state = np.asarray(proposal, dtype=np.float64)
+        if state.shape != (4,):
+            raise ValueError(f"proposal: found shape {state.shape}, expected (4,): {', '.join(STATE_NAMES)}")
+        return state
+
+    def _checked_budgets(self, name: str, missed: int | None, extra: int | None) -> dict[str, NDArray[np.int32]]:
+        weakest = self.metadata.get("smallest_must_light")
+        if not isinstance(weakest, int):
+            raise ModelError(f"{name}: metadata lack smallest_must_light; export it again with export-model")
+        tolerance = self.scene.tolerance
+        missed = tolerance.missed_budget if missed is None else missed
+        extra = tolerance.extra_budget if extra is None else extra
+        if not 0 <= missed < weakest:
+            raise ModelError(f"{name}: missed_budget {missed}: must be 0 to {weakest - 1}, below the smallest |K| of its entries")
+        if not -1 <= extra < 2**31:
+            raise ModelError(f"{name}: extra_budget {extra}: must be 0 or more, or -1 for not used")
+        return {"missed_budget": np.array(missed, dtype=np.int32), "extra_budget": np.array(extra, dtype=np.int32)}
+
+    @staticmethod
+    def _open(content: bytes, name: str, threads: int) -> onnxruntime.InferenceSession:
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.inter_op_num_threads = 1
+        options.log_severity_level = LOG_ERRORS_ONLY  # it warns of initialisers that are inputs too, which the budgets are
+        try:
+            return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime raises classes of its own that share only this one
+            reason = " ".join(str(error).split())
+            raise ModelError(f"{name}: onnxruntime {onnxruntime.__version__} cannot load it ({reason:.200})") from error
+
+
+def _packaged_model() -> Path:
+    for folder in PACKAGED_MODELS:
+        if (folder / "paper.onnx").is_file():
+            return folder / "paper.onnx"
+    raise ModelError("paper.onnx: comes with the package but is missing; give the path of a model, or reinstall glideproof")
