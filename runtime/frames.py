@@ -7,6 +7,7 @@ the first event and then every step_us, whether anything happens in them or not.
 
 from __future__ import annotations
 
+import itertools
 import operator
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -135,12 +136,10 @@ def events_to_frames(
     count = (int(t.max()) - int(t.min())) // stream.step_us + 1 if len(t) else 0
     height, width = stream.shape
     if count * height * width > LARGEST_RESULT_BYTES:
-        raise EventError(
-            f"t: found events over {count} windows, too many to hold at once; use FrameStream, which gives one frame at a time"
-        )
+        raise EventError(f"t: found events over {count} windows, too many to hold at once; use FrameStream, which gives them one by one")
     starts = np.empty(count, dtype=np.int64)
     frames = np.empty((count, height, width), dtype=np.uint8)
-    for position, (start, frame) in enumerate([*complete, *stream.flush()]):
+    for position, (start, frame) in enumerate(itertools.chain(complete, stream.flush())):
         starts[position], frames[position] = start, frame
     return starts, frames
 
@@ -157,7 +156,7 @@ def _positive(name: str, value: int) -> int:
 
 def _checked(events: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """t, x and y as int64. Raises `EventError` unless the four fields are there and hold whole numbers."""
-    fields = events.dtype.fields if isinstance(events, np.ndarray) and events.ndim == 1 else None
+    fields: Any = events.dtype.fields if isinstance(events, np.ndarray) and events.ndim == 1 else None
     if fields is None:
         raise EventError(f"events: found {type(events).__name__}; give a one-dimensional structured array with fields t, x, y, p")
     for name, kinds in (("t", "iu"), ("x", "iu"), ("y", "iu"), ("p", "iub")):

@@ -23,6 +23,19 @@ STATE_NAMES = ("theta", "x", "y", "z")
 STATE_UNITS = ("rad", "m", "m", "m")
 TILING_TOLERANCE = 1e-9
 """Largest gap or overlap between neighbouring cells, in the axis's unit, that is read as decimal rounding in the file."""
+SMALLEST_EXTENT = 1e-6
+"""Smallest width of a cell, length of a marking, altitude and distance ahead: far above `TILING_TOLERANCE`, and never lost when
+added to a coordinate."""
+LARGEST_COORDINATE = 1e6
+"""Largest size of a coordinate: with it no sum or quotient of a scene's numbers overflows, nor loses `SMALLEST_EXTENT`."""
+SMALLEST_ANGLE_AHEAD_RAD = 1e-6
+"""A point closer than this to the plane Z = 0 through the camera's centre counts as behind it: far above float64's error."""
+FOCAL_RANGE_PX = (1.0, 1e6)
+"""Focal lengths for which the margin of `build_model.rounding` covers float64's error."""
+LARGEST_PRINCIPAL_POINT_PX = 32768.0
+"""Largest distance of the principal point from the frame's corner, per axis: twice the largest frame, for the same reason."""
+LONGEST_FOUND = 200
+"""Characters of a faulty value that an error quotes."""
 
 
 class SceneError(ValueError):
@@ -31,7 +44,9 @@ class SceneError(ValueError):
 
 def _demand(holds: bool, key: str, found: object, advice: str) -> None:
     if not holds:
-        raise SceneError(f"{key}: found {found}; {advice}")
+        text = str(found)
+        quoted = text if len(text) <= LONGEST_FOUND else f"{text[:LONGEST_FOUND]}..."
+        raise SceneError(f"{key}: found {quoted}; {advice}")
 
 
 @dataclass(frozen=True)
@@ -49,6 +64,11 @@ class Camera:
             _demand(1 <= getattr(self, name) <= 16384, f"camera.{name}", getattr(self, name), "give 1 to 16384 pixels")
         for name in ("focal_length_m", "pixel_pitch_m"):
             _demand(getattr(self, name) > 0, f"camera.{name}", getattr(self, name), "give a length above 0")
+        low, high = FOCAL_RANGE_PX
+        ratio = "focal_length_m / pixel_pitch_m"
+        _demand(low <= self.focal_px <= high, f"camera.{ratio}", self.focal_px, f"give a ratio of {low:.0f} to {high:.0f} px")
+        reachable = all(abs(centre) <= LARGEST_PRINCIPAL_POINT_PX for centre in (self.u0, self.v0))
+        _demand(reachable, "camera.principal_point", self.principal_point, f"stay within {LARGEST_PRINCIPAL_POINT_PX:.0f} px of the corner")
 
     @property
     def focal_px(self) -> float:
@@ -73,7 +93,7 @@ class Camera:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What the camera model may be off by, plus or minus (theory of Theorem A, assumption on calibration)."""
+    """What the camera model may be off by, plus or minus; a tolerance of `line_px` must cover what it moves a marking by."""
 
     roll_rad: float = 0.0
     yaw_rad: float = 0.0
@@ -82,8 +102,8 @@ class Calibration:
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            _demand(0 <= value < 0.5, f"calibration.{field.name}", value, "give a plus-minus of at least 0 and below 0.5")
+            value, limit = getattr(self, field.name), 16 if field.name == "principal_px" else 0.5
+            _demand(0 <= value < limit, f"calibration.{field.name}", value, f"give a plus-minus of at least 0 and below {limit}")
 
     @property
     def exact(self) -> bool:
@@ -101,7 +121,11 @@ class Marking:
     length_m: float
 
     def __post_init__(self) -> None:
-        _demand(self.length_m > 0, f"runway.markings {self.name!r} length_m", self.length_m, "give a length above 0")
+        key = f"runway.markings {self.name!r}"
+        for name in ("x_m", "start_z_m", "length_m"):
+            value = getattr(self, name)
+            _demand(abs(value) <= LARGEST_COORDINATE, f"{key} {name}", value, f"stay within {LARGEST_COORDINATE:.0f} m")
+        _demand(self.length_m >= SMALLEST_EXTENT, f"{key} length_m", self.length_m, f"give a length of {SMALLEST_EXTENT} m or more")
 
     @property
     def ends_z_m(self) -> tuple[float, float]:
@@ -141,12 +165,15 @@ class Axis:
     def check(self, key: str) -> None:
         """Raises `SceneError` unless the cells tile an interval without gap or overlap."""
         _demand(len(self.centres) > 0, f"{key}.centres", "none", "give at least one centre")
-        _demand(self.width >= 0, f"{key}.width", self.width, "give a width of 0 (fixed axis) or more")
+        for value in self.centres:
+            _demand(abs(value) <= LARGEST_COORDINATE, f"{key}.centres", value, f"stay within {LARGEST_COORDINATE:.0f}")
+        usable = self.width == 0 or SMALLEST_EXTENT <= self.width <= LARGEST_COORDINATE
+        _demand(usable, f"{key}.width", self.width, f"give 0 (fixed axis), or {SMALLEST_EXTENT} to {LARGEST_COORDINATE:.0f}")
         if self.width == 0:
             _demand(len(self.centres) == 1, f"{key}.centres", list(self.centres), "an axis of width 0 has one centre")
         for left, right in itertools.pairwise(self.centres):
             gap = right - left - self.width
-            _demand(abs(gap) <= TILING_TOLERANCE, f"{key}.centres", f"{left} and {right}", f"neighbours must lie {self.width} apart")
+            _demand(abs(gap) <= TILING_TOLERANCE, f"{key}.centres", f"{left} and {right}", f"neighbours must ascend by {self.width}")
 
     @property
     def edges(self) -> NDArray[np.float64]:
@@ -169,7 +196,7 @@ class Domain:
             axis.check(f"domain.{field.name}")
         low, high = self.lower, self.upper
         _demand(low[0] > -math.pi / 2 and high[0] < math.pi / 2, "domain.theta_rad", [low[0], high[0]], "stay within -pi/2 and pi/2")
-        _demand(low[2] > 0, "domain.y_m", low[2], "the camera must be above the runway: y > 0 throughout")
+        _demand(low[2] >= SMALLEST_EXTENT, "domain.y_m", low[2], "the camera must be above the runway: y > 0 throughout")
 
     @property
     def axes(self) -> tuple[Axis, Axis, Axis, Axis]:
@@ -256,23 +283,27 @@ class Scene:
     estimator: EstimatorTraining = EstimatorTraining()
 
     def __post_init__(self) -> None:
-        nearest = self.domain.lower[3] + self.runway.ends_z_m.min()
-        _demand(nearest > 0, "domain.z_m", self.domain.lower[3], "some state has a marking's end beside or behind the camera: z + start_z_m > 0")
-        steepest = math.atan2(self.domain.upper[2], nearest) - self.domain.lower[0]
-        flattest = math.atan2(self.domain.lower[2], self.domain.upper[3] + self.runway.ends_z_m.max()) - self.domain.upper[0]
-        _demand(-math.pi / 2 < flattest and steepest < math.pi / 2, "domain", "a state", "the runway is behind the camera (Z <= 0): narrow theta_rad or z_m")
+        low, high = self.domain.lower, self.domain.upper
+        nearest, farthest = low[3] + self.runway.ends_z_m.min(), high[3] + self.runway.ends_z_m.max()
+        _demand(nearest >= SMALLEST_EXTENT, "domain.z_m", low[3], "a marking starts beside or behind the camera: keep z + start_z_m > 0")
+        steepest, flattest = math.atan2(high[2], nearest) - low[0], math.atan2(low[2], farthest) - high[0]
+        widest = math.pi / 2 - SMALLEST_ANGLE_AHEAD_RAD
+        ahead = -widest <= flattest and steepest <= widest
+        _demand(ahead, "domain", "a state with the runway behind the camera (Z <= 0)", "narrow theta_rad, y_m or z_m")
 
     @classmethod
     def load(cls, path: str | Path) -> Scene:
         """Reads a scene file. Raises `SceneError` for a missing file, bad TOML or a bad value."""
         try:
             text = Path(path).read_text(encoding="utf-8")
-        except (OSError, UnicodeDecodeError) as error:
+        except (OSError, ValueError) as error:
             raise SceneError(f"{path}: cannot be read ({error}); give the path of a TOML scene file") from error
         try:
-            return cls.from_dict(tomllib.loads(text))
-        except tomllib.TOMLDecodeError as error:
-            raise SceneError(f"{path}: not TOML ({error})") from error
+            tables = tomllib.loads(text)
+        except (ValueError, RecursionError) as error:
+            raise SceneError(f"{path}: not TOML ({error}); correct it there") from error
+        try:
+            return cls.from_dict(tables)
         except SceneError as error:
             raise SceneError(f"{path}: {error}") from error
 
@@ -295,6 +326,8 @@ def _plain(value: Any) -> Any:
 
 def _read(kind: Any, value: Any, key: str) -> Any:
     """`value` as `kind`: a dataclass, a tuple, a number or a text. Raises `SceneError` that names `key`."""
+    small = not isinstance(value, int) or value.bit_length() < 64
+    _demand(small, key, "a whole number beyond 64 bits", "give a smaller one")
     if dataclasses.is_dataclass(kind):
         return _read_table(kind, value, key)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
@@ -316,7 +349,8 @@ def _read_table(kind: Any, table: Any, key: str) -> Any:
     hints, fields = typing.get_type_hints(kind), dataclasses.fields(kind)
     prefix = f"{key}." if key else ""
     for name in table:
-        _demand(name in hints, f"{prefix}{name}", "an unknown key", f"known here: {', '.join(hints)}")
+        shown = name if isinstance(name, str) and name.isprintable() else repr(name)
+        _demand(name in hints, f"{prefix}{shown}", "an unknown key", f"known here: {', '.join(hints)}")
     for field in fields:
         optional = field.default is not dataclasses.MISSING
         _demand(optional or field.name in table, f"{prefix}{field.name}", "nothing", "this key is required")

@@ -1,0 +1,104 @@
+"""The build's commands. They parse and print; `build_model.export` does the work."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+if TYPE_CHECKING:
+    from build_model.export import ExportReport
+    from runtime.scene import Scene
+
+try:
+    import typer
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.table import Table
+except ImportError as error:
+    raise SystemExit(f"export-model: the package {error.name!r} is missing; pip install 'glideproof[build]'") from None
+
+DEFAULT_SCENE = Path("models/paper.toml")
+USER_ERROR = 2
+INTERRUPTED = 130
+
+
+def fail(message: object, code: int = USER_ERROR) -> NoReturn:
+    """One line on stderr, then exit."""
+    print(" ".join(str(message).split()), file=sys.stderr)
+    raise typer.Exit(code)
+
+
+def export_model(
+    scene: Annotated[Path, typer.Argument(help="Scene file (TOML).")] = DEFAULT_SCENE,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Model to write; by default the scene's name in out/.")] = None,
+    estimator: Annotated[Path | None, typer.Option(help="Your own NN_e: float32 [1,1,height,width] to [1,4].")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the training.")] = 0,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes that build cells.")] = 2,
+) -> None:
+    """Build NN_F from the scene, train NN_e (or take yours), and write one ONNX file with both."""
+    try:
+        from build_model.export import EstimatorError, export_model
+        from runtime.scene import Scene, SceneError
+    except ImportError as error:
+        fail(f"export-model: the package {error.name!r} is missing; pip install 'glideproof[build]'")
+    target = output or Path("out") / f"{scene.stem}.onnx"
+    console = Console()
+    try:
+        loaded = Scene.load(scene)
+        with _progress(console) as bars:
+            report = export_model(loaded, target, estimator=estimator, seed=seed, jobs=jobs, progress=_Bars(bars).update)
+    except (SceneError, EstimatorError) as error:
+        fail(error)
+    except OSError as error:
+        fail(f"{target}: cannot be written ({error.strerror}); the model that was there before is untouched")
+    except KeyboardInterrupt:
+        fail(f"{target}: interrupted; the model that was there before is untouched", INTERRUPTED)
+    _print_summary(console, loaded, target, report)
+
+
+def _progress(console: Console) -> Progress:
+    columns = (TextColumn("{task.description:<22}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.fields[loss]}"))
+    return Progress(*columns, console=console)
+
+
+class _Bars:
+    """One progress bar a stage, made when the stage is first heard of."""
+
+    def __init__(self, progress: Progress) -> None:
+        self.progress = progress
+        self.tasks = {}
+
+    def update(self, stage: str, done: int, total: int, loss: float | None) -> None:
+        if stage not in self.tasks:
+            self.tasks[stage] = self.progress.add_task(stage, total=total, loss="")
+        self.progress.update(self.tasks[stage], completed=done, total=total, loss="" if loss is None else f"loss {loss:.5f}")
+
+
+def _print_summary(console: Console, scene: Scene, target: Path, report: ExportReport) -> None:
+    from build_model.export import assumptions
+
+    table = Table(title=str(target), show_header=False, title_justify="left")
+    rows = {
+        "cells": report.cells,
+        "entries": report.entries,
+        "smallest |K| - m": report.smallest_must_light - scene.tolerance.missed_budget,
+        "S, pixels a cell": f"{report.spatial_pixels.min()} to {report.spatial_pixels.max()}",
+        "calibration moves the image by": f"{report.displacement_px:.2f} px at most (line_px {scene.tolerance.line_px})",
+        **{f"{stage}, seconds": f"{seconds:.1f}" for stage, seconds in report.seconds.items()},
+        "file": f"{report.file_bytes / 1e6:.2f} MB",
+        "sha256": report.sha256,
+    }
+    for name, value in rows.items():
+        table.add_row(name, str(value))
+    console.print(table)
+    if report.training is not None:
+        console.print(report.training.table())
+    console.print("The certificate assumes:")
+    for line in assumptions(scene):
+        console.print(f"  - {line}", highlight=False)
+
+
+def export_model_command() -> None:
+    """Entry point of `export-model`."""
+    typer.run(export_model)

@@ -1,0 +1,260 @@
+"""export-model: scene in, one ONNX file with NN_F and NN_e out.
+
+The certified part is built cell by cell (`hough_bank`), laid out (`filter_network`) and written as a graph (`filter_graph`); NN_e is
+trained on frames that this very graph filters (`state_network`), or taken from the user; both become one graph, with everything that
+a runtime or a verifier must know in its metadata. The same scene, seed and versions give the same bytes, whatever `jobs` is.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from importlib import metadata as distributions
+from pathlib import Path
+from typing import Any
+
+import joblib
+import numpy as np
+import onnx
+import onnx.compose
+import onnx.version_converter
+import onnxruntime
+import torch
+from numpy.typing import NDArray
+from onnx import TensorProto, helper
+
+from build_model.calibration import check_calibration
+from build_model.filter_graph import IR_VERSION, OPSET, GraphWriter, filter_graph
+from build_model.filter_network import FilterTables, assemble
+from build_model.hough_bank import CellBank, cell_bank
+from build_model.partition import partition
+from build_model.reachability import paper_bound
+from build_model.rounding import OUTWARD_PX
+from build_model.state_network import TrainingReport, train_state_network
+from runtime.model_file import FORMAT_VERSION, METADATA_KEY
+from runtime.scene import Scene
+
+Progress = Callable[[str, int, int, float | None], None]
+"""Called with a stage, steps done, steps in all, and the loss where there is one."""
+NETWORK_PREFIX = "state_network/"
+VERSIONS = ("glideproof", "numpy", "onnx", "onnxruntime", "torch")
+
+
+class EstimatorError(ValueError):
+    """A user's network that cannot serve as NN_e."""
+
+
+@dataclass(frozen=True)
+class ExportReport:
+    """What was built, for the summary."""
+
+    cells: int
+    entries: int
+    smallest_must_light: int
+    spatial_pixels: NDArray[np.int64]
+    displacement_px: float
+    file_bytes: int
+    sha256: str
+    seconds: dict[str, float]
+    training: TrainingReport | None
+
+
+@dataclass
+class _Stopwatch:
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.seconds[name] = time.perf_counter() - start
+
+
+def _silent(_stage: str, _done: int, _total: int, _loss: float | None) -> None:
+    pass
+
+
+def export_model(
+    scene: Scene, path: str | Path, *, estimator: str | Path | None = None, seed: int = 0, jobs: int = 1, progress: Progress = _silent
+) -> ExportReport:
+    """Builds the scene's model and writes it to `path`, whole or not at all.
+
+    `estimator`: an ONNX file to serve as NN_e in place of a trained one. Raises `SceneError` for a scene that has no certificate,
+    `EstimatorError` for a network that does not fit, OSError if the file cannot be written.
+    """
+    watch = _Stopwatch()
+    with watch.stage("NN_F"):
+        banks = build_banks(scene, jobs, progress)
+        tables = assemble(scene, banks)
+        shift_px = check_calibration(scene, tables.window)
+        filter_part = filter_graph(scene, tables)
+    with watch.stage("NN_e"):
+        network, report = _state_network(scene, filter_part, estimator, seed, progress)
+    with watch.stage("file"):
+        graph = _joined(filter_part, network)
+        content = _serialised(graph, _metadata(scene, tables, graph, shift_px, report, seed))
+        write_atomically(Path(path), content)
+    return ExportReport(
+        cells=len(banks),
+        entries=sum(len(bank) for bank in banks),
+        smallest_must_light=tables.smallest_must_light,
+        spatial_pixels=np.concatenate([bank.spatial.sizes(1) for bank in banks]),
+        displacement_px=shift_px,
+        file_bytes=len(content),
+        sha256=hashlib.sha256(content).hexdigest(),
+        seconds=watch.seconds,
+        training=report,
+    )
+
+
+def build_banks(scene: Scene, jobs: int = 1, progress: Progress = _silent) -> list[CellBank]:
+    """S, entries, O and K of every cell, in the order of the partition; cells are independent and built by `jobs` processes."""
+    cells = partition(scene)
+    work = (joblib.delayed(cell_bank)(scene, lower, upper) for lower, upper in zip(cells.lower, cells.upper, strict=True))
+    banks = []
+    for bank in joblib.Parallel(n_jobs=jobs, return_as="generator")(work):
+        banks.append(bank)
+        progress("cells", len(banks), len(cells), None)
+    return banks
+
+
+def filter_function(filter_part: onnx.GraphProto) -> Callable[[NDArray[np.uint8]], NDArray[np.uint8]]:
+    """NN_F alone as a function from frames (n, height, width) to filtered frames of the same shape."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.log_severity_level = 3  # it warns of the budgets, initialisers that are inputs too
+    session = onnxruntime.InferenceSession(_serialised(filter_part, {}), options, providers=["CPUExecutionProvider"])
+    return lambda frames: np.stack([session.run(["filtered"], {"frame": frame})[0] for frame in frames])
+
+
+def _state_network(
+    scene: Scene, filter_part: onnx.GraphProto, estimator: str | Path | None, seed: int, progress: Progress
+) -> tuple[onnx.GraphProto, TrainingReport | None]:
+    """NN_e as a graph: the user's, or one trained on what NN_F lets through."""
+    if estimator is not None:
+        return user_network(scene, Path(estimator)), None
+    network, report = train_state_network(scene, filter_function(filter_part), seed, progress)
+    example = torch.zeros((1, 1, *scene.camera.shape), dtype=torch.uint8)
+    program = torch.onnx.export(network, (example,), dynamo=True, opset_version=OPSET, optimize=True, verbose=False)
+    if program is None:
+        raise RuntimeError("torch.onnx.export gave no program")
+    return program.model_proto.graph, report
+
+
+def user_network(scene: Scene, path: Path) -> onnx.GraphProto:
+    """A user's NN_e. Raises `EstimatorError` unless it maps float32 [1, 1, height, width] to float32 [1, 4] with fixed shapes."""
+    try:
+        model = onnx.load(path, load_external_data=False)
+        onnx.checker.check_model(model)
+        model = onnx.version_converter.convert_version(model, OPSET) if model.opset_import[0].version != OPSET else model
+    except OSError as error:
+        raise EstimatorError(f"{path}: cannot be read ({error.strerror}); give the path of an ONNX file") from error
+    except Exception as error:  # onnx's parser, checker and converter raise classes that share only this one
+        reason = " ".join(str(error).split())
+        raise EstimatorError(f"{path}: not a usable ONNX model ({reason:.160})") from error
+    graph = model.graph
+    given = {tensor.name for tensor in graph.initializer}
+    inputs = [value for value in graph.input if value.name not in given]
+    expected = f"one input float32 [1, 1, {scene.camera.height}, {scene.camera.width}] and one output float32 [1, 4]"
+    found = f"inputs {[_described(value) for value in inputs]} and outputs {[_described(value) for value in graph.output]}"
+    wanted = [f"FLOAT {[1, 1, *scene.camera.shape]}"], [f"FLOAT {[1, 4]}"]
+    if ([_described(value) for value in inputs], [_described(value) for value in graph.output]) != wanted:
+        raise EstimatorError(f"{path}: found {found}; expected {expected}")
+    if any(domain.domain not in ("", "ai.onnx") for domain in model.opset_import) or model.functions:
+        raise EstimatorError(f"{path}: found operators or functions of its own; expected standard operators only")
+    return graph
+
+
+def _described(value: onnx.ValueInfoProto) -> str:
+    tensor = value.type.tensor_type
+    dims = [dim.dim_value if dim.HasField("dim_value") else dim.dim_param or "?" for dim in tensor.shape.dim]
+    return f"{TensorProto.DataType.Name(tensor.elem_type)} {dims}"
+
+
+def _joined(filter_part: onnx.GraphProto, network: onnx.GraphProto) -> onnx.GraphProto:
+    """NN_e behind NN_F: `network_state` = NN_e(filtered)."""
+    g = GraphWriter()
+    network = onnx.compose.add_prefix_graph(_bare(network), NETWORK_PREFIX)
+    image = g.node("Unsqueeze", "filtered_image", "filtered", g.whole("batch_and_channel", 0, 1))
+    elem_type = network.input[0].type.tensor_type.elem_type
+    image = image if elem_type == TensorProto.UINT8 else g.node("Cast", "filtered_float", image, to=TensorProto.FLOAT)
+    feed = helper.make_node("Identity", [image], [network.input[0].name], name="network_input")
+    g.node("Reshape", "network_state", network.output[0].name, g.whole("state_shape", 4))
+    joined = onnx.GraphProto()
+    joined.CopyFrom(filter_part)
+    joined.node.extend([*g.nodes[:-1], feed, *network.node, g.nodes[-1]])
+    joined.initializer.extend([*g.constants, *network.initializer])
+    joined.output.append(helper.make_tensor_value_info("network_state", TensorProto.FLOAT, [4]))
+    return joined
+
+
+def _bare(network: onnx.GraphProto) -> onnx.GraphProto:
+    """The graph without notes of how it came about, which name files of the machine that made it."""
+    bare = onnx.GraphProto()
+    bare.CopyFrom(network)
+    for part in (bare, *bare.node, *bare.input, *bare.output, *bare.initializer):
+        part.ClearField("metadata_props")
+        part.ClearField("doc_string")
+    bare.ClearField("value_info")
+    return bare
+
+
+def _metadata(
+    scene: Scene, tables: FilterTables, graph: onnx.GraphProto, shift_px: float, report: TrainingReport | None, seed: int
+) -> dict[str, Any]:
+    bounds = [paper_bound(scene, lower, upper) for lower, upper in zip(tables.cells.lower, tables.cells.upper, strict=True)]
+    return {
+        "format_version": FORMAT_VERSION,
+        "scene": scene.to_dict(),
+        "graph_sha256": hashlib.sha256(graph.SerializeToString(deterministic=True)).hexdigest(),
+        "smallest_must_light": tables.smallest_must_light,
+        "margin_px": OUTWARD_PX,
+        "calibration_shift_px": shift_px,
+        "assumptions": assumptions(scene),
+        "paper_bounds": [None if bound is None else asdict(bound) for bound in bounds],
+        "training": None if report is None else asdict(report),
+        "seed": seed,
+        "versions": {"python": platform.python_version(), **{name: distributions.version(name) for name in VERSIONS}},
+    }
+
+
+def assumptions(scene: Scene) -> list[str]:
+    """What every certificate of this model takes for granted (Theorem A; the last line, Theorem B, where it is switched on)."""
+    tolerance = scene.tolerance
+    near = f" within {tolerance.line_px} px" if tolerance.line_px else ""
+    lines = [
+        "The state lies in the scene's domain; a box that reaches a face of the domain says so.",
+        f"No roll or yaw, and the camera as in the scene, up to its [calibration] and {tolerance.line_px} px.",
+        f"At most {tolerance.missed_budget} pixels of the runway's image have no lit pixel{near}.",
+    ]
+    if tolerance.extra_budget >= 0:
+        lines.append(f"At most {tolerance.extra_budget} lit pixels of the true cell's spatial mask are not the runway's{near}.")
+    return lines
+
+
+def _serialised(graph: onnx.GraphProto, metadata: dict[str, Any]) -> bytes:
+    """The model file: graph, versions and metadata, checked by onnx."""
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, producer_name="glideproof")
+    helper.set_model_props(model, {METADATA_KEY: json.dumps(metadata, sort_keys=True)})
+    onnx.checker.check_model(model, full_check=True)
+    return model.SerializeToString(deterministic=True)
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Writes beside `path` and renames, so that what lay there before stays whole until the new file is."""
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with part.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        part.replace(path)
+    finally:
+        part.unlink(missing_ok=True)

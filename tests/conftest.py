@@ -1,0 +1,45 @@
+"""Shared by all tests: the paper's scene, random states of a domain, Hypothesis's profiles, one thread a worker.
+
+Hypothesis runs its "quick" profile, the same examples every time; `--hypothesis-profile=long` draws new and many more.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, settings
+from numpy.typing import NDArray
+
+from runtime.scene import Scene
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: pytest runs one worker a core
+
+settings.register_profile("quick", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("long", deadline=None, max_examples=5000, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("quick")
+
+
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    """The repository's root."""
+    return Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="session")
+def paper_scene(repository: Path) -> Scene:
+    """The paper's experiment, models/paper.toml."""
+    return Scene.load(repository / "models" / "paper.toml")
+
+
+@pytest.fixture(scope="session")
+def random_states() -> Callable[[Scene, int, int], NDArray[np.float64]]:
+    """`random_states(scene, count, seed)`: (count, 4) states, uniform over the scene's domain."""
+
+    def draw(scene: Scene, count: int, seed: int) -> NDArray[np.float64]:
+        return np.random.default_rng(seed).uniform(scene.domain.lower, scene.domain.upper, (count, 4))
+
+    return draw

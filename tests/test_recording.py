@@ -1,0 +1,191 @@
+"""Recordings: what is read is what was written; what cannot be read is an error of one line."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from runtime.frames import FrameStream
+from runtime.recording import EVENT, PACKET_EVENTS, RecordingError, read_events, sensor_shape
+
+SHAPE = (10, 20)
+RECORDINGS = Path(os.environ.get("GLIDEPROOF_RECORDINGS", Path(__file__).resolve().parents[2] / "shared" / "recordings"))
+
+
+def random_events(count: int) -> NDArray:
+    generator = np.random.default_rng(1)
+    events = np.empty(count, dtype=EVENT)
+    events["t"] = np.sort(generator.integers(0, 100_000, count))
+    events["x"], events["y"], events["p"] = (
+        generator.integers(0, 20, count),
+        generator.integers(0, 10, count),
+        generator.integers(0, 2, count),
+    )
+    return events
+
+
+def read(path: Path, shape: tuple[int, int] | None = None) -> NDArray:
+    return np.concatenate([np.empty(0, dtype=EVENT), *read_events(path, shape)])
+
+
+def written_by_faery(path: Path, events: NDArray, version: str | None = None) -> Path:
+    faery = pytest.importorskip("faery", reason="the extra 'recordings' is not installed")
+    packet = np.empty(len(events), dtype=faery.EVENTS_DTYPE)
+    packet["t"], packet["x"], packet["y"], packet["on"] = events["t"], events["x"], events["y"], events["p"]
+    faery.events_stream_from_array(packet, dimensions=SHAPE[::-1]).to_file(path, version=version, zero_t0=False)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "version"), [("a.raw", "evt2"), ("b.raw", "evt3"), ("c.dat", "dat2"), ("d.es", None), ("e.aedat4", None), ("f.csv", None)]
+)
+def test_what_faery_writes_is_read(tmp_path, name, version):
+    events = random_events(500)
+    path = written_by_faery(tmp_path / name, events, version)
+    assert sensor_shape(path) == SHAPE
+    for shape in (SHAPE, None):
+        back = read(path, shape)
+        # EVT3 groups the events of one time by rows: the order within a time is the format's own.
+        assert back.dtype == EVENT
+        assert np.all(np.diff(back["t"]) >= 0)
+        np.testing.assert_array_equal(np.sort(back, order=EVENT.names), np.sort(events, order=EVENT.names))
+
+
+@pytest.mark.parametrize("version", ["evt2", "evt3"])
+@pytest.mark.parametrize(
+    ("header", "shape"),
+    [
+        ("% evt {v}\n% geometry 20x10\n", SHAPE),
+        ("% evt {v}\r\n% format EVT{n};height=10;width=20\r\n% end\r\n", SHAPE),
+        ("% format EVT{n};width=20;height=10\n% end\n", SHAPE),
+        ("% evt {v}\n% Width 20\n% Height 10\n% end\n", SHAPE),
+        ("% evt {v}\n% end\n", None),
+    ],
+)
+def test_the_geometry_is_taken_from_the_header_or_from_the_caller(tmp_path, version, header, shape):
+    events = random_events(200)
+    data = written_by_faery(tmp_path / "written.raw", events, version).read_bytes()
+    payload = data[data.index(b"% geometry 20x10\n") + len(b"% geometry 20x10\n") :]
+    path = tmp_path / "header.raw"
+    path.write_bytes(header.format(v=f"{version[3]}.0", n=version[3]).encode() + payload)
+    assert sensor_shape(path) == shape
+    assert len(read(path, SHAPE)) == len(events)
+    if shape is None:
+        with pytest.raises(RecordingError, match="the header tells no sensor size"):
+            read_events(path)
+
+
+@pytest.mark.parametrize(("name", "version"), [("a.raw", "evt3"), ("b.dat", "dat2"), ("c.es", None), ("d.aedat4", None), ("e.csv", None)])
+def test_another_sensor_size_is_refused_with_both_sizes(tmp_path, name, version):
+    path = written_by_faery(tmp_path / name, random_events(5), version)
+    with pytest.raises(RecordingError, match=r"sensor of 20x10 px, expected 640x480"):
+        read_events(path, (480, 640))
+
+
+def test_npz_is_read_in_packets_and_keeps_unsorted_times(tmp_path):
+    events = random_events(PACKET_EVENTS + 10)
+    events["t"][[0, -1]] = events["t"][[-1, 0]]
+    np.savez(
+        tmp_path / "a.npz", t=events["t"].astype(np.uint64), x=events["x"].astype(np.uint16), y=events["y"], p=events["p"].astype(bool)
+    )
+    packets = list(read_events(tmp_path / "a.npz", SHAPE))
+    assert [len(packet) for packet in packets] == [PACKET_EVENTS, 10]
+    np.testing.assert_array_equal(np.concatenate(packets), events)
+
+
+@pytest.mark.parametrize(
+    "text", ["100,3,4,1\n50,5,6,-1\n", "t,x,y,p\n100,3,4,1\n\n50,5,6,-1", "x, y, polarity, t\r\n3, 4, 1, 100\r\n5, 6, -1, 50\r\n\r\n"]
+)
+def test_csv_with_and_without_a_header_keeps_every_event_and_its_time(tmp_path, text):
+    (tmp_path / "a.csv").write_text(text, newline="")
+    assert read(tmp_path / "a.csv").tolist() == [(100, 3, 4, 1), (50, 5, 6, -1)]
+
+
+def test_csv_is_read_in_packets(tmp_path):
+    events = random_events(PACKET_EVENTS + 3)
+    np.savetxt(tmp_path / "a.csv", events, fmt="%d", delimiter=",")
+    packets = list(read_events(tmp_path / "a.csv"))
+    assert [len(packet) for packet in packets] == [PACKET_EVENTS, 3]
+    np.testing.assert_array_equal(np.concatenate(packets), events)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.raw", b"", "found no format in the header; convert it to EVT2 or EVT3"),
+        ("a.raw", b"% evt 2.1\n% geometry 20x10\n% end\n", "found format 2.1"),
+        ("a.raw", b"% format EVT21;height=10;width=20\n", "found format EVT21"),
+        ("a.dat", b"not a dat file at all", "a.dat: "),
+        ("a.es", b"not an es file at all", "a.es: "),
+        ("a.aedat4", b"not an aedat file at all", "a.aedat4: "),
+        ("a.npz", b"PK nothing", "cannot be read"),
+        ("a.csv", b"", "no column t, x, y, p in the first line"),
+        ("a.csv", b"t,x,y\n1,2,3\n", "no column p"),
+        ("a.csv", b"t,x,y,p\n1,2,3,1\n1.5,2,3,0\n", "lines 2 to 3: .*1.5"),
+        ("a.csv", b"1,2,3,1\n1,2\n", "lines 1 to 2"),
+        ("a.txt", b"1,2,3,1\n", "unknown kind '.txt'; known are .raw, .dat, .es, .aedat4, .csv, .npz"),
+    ],
+)
+def test_an_unreadable_file_is_an_error_of_one_line_that_names_it(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(RecordingError, match=message) as caught:
+        read(tmp_path / name, SHAPE)
+    assert str(caught.value).startswith(str(tmp_path / name))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"t": [1], "x": [1], "y": [1]}, "no array p"),
+        ({"t": [0.5], "x": [1], "y": [1], "p": [1]}, "t is float64"),
+        ({"t": [1], "x": [[1]], "y": [1], "p": [1]}, r"x is int64 of shape \(1, 1\)"),
+        ({"t": [1, 2], "x": [1], "y": [1], "p": [1]}, "arrays of different lengths"),
+        ({"t": [1], "x": [2**32 + 1], "y": [1], "p": [1]}, "x runs from 4294967297 to 4294967297, beyond int32"),
+    ],
+)
+def test_unusable_npz_columns_are_refused(tmp_path, columns, message):
+    np.savez(tmp_path / "a.npz", **columns)
+    with pytest.raises(RecordingError, match=message):
+        read_events(tmp_path / "a.npz")
+
+
+def test_a_missing_file_is_refused_at_once(tmp_path):
+    with pytest.raises(RecordingError, match="no such file"):
+        read_events(tmp_path / "a.raw")
+
+
+def test_without_faery_one_line_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "faery", None)
+    (tmp_path / "a.raw").write_bytes(b"% evt 3.0\n% geometry 20x10\n% end\n")
+    with pytest.raises(RecordingError, match=r"needs faery, .*pip install glideproof\[recordings\]"):
+        read_events(tmp_path / "a.raw")
+
+
+def test_an_event_beyond_the_sensor_of_the_header_is_an_error(tmp_path):
+    path = written_by_faery(tmp_path / "a.raw", random_events(50), "evt3")
+    path.write_bytes(path.read_bytes().replace(b"20x10", b"19x10").replace(b"width=20", b"width=19"))
+    with pytest.raises(RecordingError, match="x overflow"):
+        read(path)
+
+
+def test_the_real_recording_gives_its_events_and_frames():
+    path = RECORDINGS / "ecpy_test1_640x480_evt3.raw"
+    if not path.is_file():
+        pytest.skip(f"{path} is missing; set GLIDEPROOF_RECORDINGS to the folder of the recordings")
+    pytest.importorskip("faery", reason="the extra 'recordings' is not installed")
+    stream = FrameStream((480, 640), 40_000)
+    lit, count = [], 0
+    for packet in read_events(path, (480, 640)):
+        count += len(packet)
+        lit += [frame.mean() for _, frame in stream.feed(packet)]
+    lit += [frame.mean() for _, frame in stream.flush()]
+    assert count == 343_474
+    assert len(lit) == 52  # 2.078 s of 40 ms
+    assert 0.005 < np.median(lit) < 0.02
+    assert (stream.late_events, stream.unsorted_events, stream.outside_events) == (0, 0, 0)
