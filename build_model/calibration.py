@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 
 from build_model.pixel_mask import Window
-from build_model.rounding import above
+from runtime.rounding import above
 from runtime.scene import Scene, SceneError
 
 

@@ -35,9 +35,9 @@ from build_model.filter_network import FilterTables, assemble
 from build_model.hough_bank import CellBank, cell_bank
 from build_model.partition import partition
 from build_model.reachability import paper_bound
-from build_model.rounding import OUTWARD_PX
 from build_model.state_network import TrainingReport, train_state_network
 from runtime.model_file import FORMAT_VERSION, METADATA_KEY
+from runtime.rounding import OUTWARD_PX
 from runtime.scene import Scene
 
 Progress = Callable[[str, int, int, float | None], None]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from build_model.filter_network import FilterTables, RunTable
-from build_model.rounding import float32_above, float32_below
+from runtime.rounding import float32_above, float32_below
 from runtime.scene import Scene
 
 OPSET = 20
@@ -65,6 +65,7 @@ def filter_graph(scene: Scene, tables: FilterTables) -> onnx.GraphProto:
         helper.make_tensor_value_info("cell", TensorProto.INT64, []),
         helper.make_tensor_value_info("support", TensorProto.INT32, [cells]),
         helper.make_tensor_value_info("mismatch", TensorProto.INT32, [cells]),
+        helper.make_tensor_value_info("passes", TensorProto.BOOL, [cells, tables.entries]),
         helper.make_tensor_value_info("cell_lower", TensorProto.FLOAT, [cells, 4]),
         helper.make_tensor_value_info("cell_upper", TensorProto.FLOAT, [cells, 4]),
         helper.make_tensor_value_info("filtered", TensorProto.UINT8, scene.camera.shape),

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from build_model.hough_bank import CellBank
 from build_model.partition import Partition, partition
 from build_model.pixel_mask import Runs, Window
-from build_model.rounding import float32_above, float32_below
+from runtime.rounding import float32_above, float32_below
 from runtime.scene import Scene
 
 NEVER = 2**20

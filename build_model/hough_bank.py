@@ -20,17 +20,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from build_model.enclosure import (
-    StateSet,
-    columns_that_may_be_lit,
-    columns_that_must_be_lit,
-    contract,
-    scale_range,
-)
+from build_model.enclosure import columns_that_may_be_lit, columns_that_must_be_lit
 from build_model.pixel_mask import Runs, Window, clip_and_widen, paint, runs_of
-from build_model.rounding import float32_above, float32_below, inverted
 from build_model.spatial_filter import reference_row, sliced, spatial_filter
+from runtime.rounding import float32_above, float32_below, inverted
 from runtime.scene import Scene, SceneError
+from runtime.state_set import StateSet, contract, scale_range
 
 SCALE_STEP = 2.0**-10
 """Bins of the scale have borders on multiples of this, px per metre, so that they do not depend on the machine's libm."""

@@ -23,9 +23,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from build_model.pixel_mask import Bits, Window
-from build_model.rounding import above, below
 from build_model.runway_network import ABS_PAIRS, MIN_PAIRS, pixel_weights
 from runtime.camera import project, row_of_point
+from runtime.rounding import above, below
 from runtime.scene import Scene
 
 Floats = NDArray[np.float64]
@@ -463,6 +463,8 @@ def network_upper_bounds(window: Window, lower: Floats, upper: Floats, method: M
 
     `printed_jacobians` as in `layers`; only `Method.MIXED_MONOTONICITY` uses Jacobians.
     """
+    if 0 in window.shape:
+        return np.zeros(window.shape)
     low, high = snap_outward(lower, upper, window)
     weights = pixel_weights(window).reshape(-1, 16, 6)
     if method is Method.INTERVALS:
@@ -470,7 +472,7 @@ def network_upper_bounds(window: Window, lower: Floats, upper: Floats, method: M
     if method is Method.CLOSED_FORM:
         return _upper_bound_of_image(linear_layer_range(weights, low, high)).reshape(window.shape)
     parts = []
-    for start in range(0, max(len(weights), 1), PIXELS_AT_ONCE):
+    for start in range(0, len(weights), PIXELS_AT_ONCE):
         part = weights[start : start + PIXELS_AT_ONCE]
         boxes = (np.broadcast_to(bound, (len(part), 4)) for bound in (low, high))
         parts.append(mixed_monotone_layers(layers(part, printed_jacobians=printed_jacobians), *boxes)[-1][1])

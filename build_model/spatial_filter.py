@@ -9,11 +9,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from build_model.enclosure import StateSet, columns_that_may_be_lit, contract, scale_range
+from build_model.enclosure import columns_that_may_be_lit
 from build_model.partition import partition
 from build_model.pixel_mask import Bits, Window, clip_and_widen, paint, window_of
 from runtime.camera import row_of_point
 from runtime.scene import Camera, Scene, SceneError
+from runtime.state_set import StateSet, contract, scale_range
 
 SLICES = 32
 """Slices of theta a cell. Eight times as many take less than one pixel in 100 from S of the paper's cells."""

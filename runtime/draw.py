@@ -30,9 +30,10 @@ Picture = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 
 BACKGROUND, TEXT, FRAME, FRAME_BORDER = (24, 22, 20), (225, 225, 225), (150, 150, 150), (90, 90, 90)
-MASK, MASK_TEXT, FILTERED, BOX, STATE, TRUTH = (120, 70, 30), (230, 140, 70), (90, 215, 70), (0, 170, 255), (255, 60, 255), (255, 255, 255)
+MASK, MASK_TEXT, FILTERED, BOX, STATE, TRUTH = (140, 60, 20), (230, 140, 70), (90, 215, 70), (0, 170, 255), (255, 60, 255), (255, 255, 255)
 CERTIFIED, NO_RUNWAY = (90, 215, 70), (80, 80, 255)
-BOX_OPACITY = 0.22
+BOX_LIGHT = 0.16
+"""Share of its colour that the box adds to what lies under it: blue stays blue, dark turns amber."""
 SAMPLES = 5
 """States an axis at which a box is projected."""
 FRACTION_BITS = 4
@@ -110,7 +111,8 @@ def draw_runway(
 
 
 def contact_sheet(pictures: Sequence[Picture], columns: int = 4, gap: int = 8) -> Picture:
-    """Pictures of one shape, row by row, `gap` px apart."""
+    """Pictures of one shape, row by row, at most `columns` beside each other, `gap` px apart."""
+    columns = min(columns, len(pictures))
     height, width, _ = pictures[0].shape
     rows = -(-len(pictures) // columns)
     sheet = np.full((rows * (height + gap) + gap, columns * (width + gap) + gap, 3), FRAME_BORDER, dtype=np.uint8)
@@ -122,9 +124,9 @@ def contact_sheet(pictures: Sequence[Picture], columns: int = 4, gap: int = 8) -
 
 
 def runway_view(scene: Scene, estimate: Estimate, truth: ArrayLike | None, zoom: int, scale: int) -> View:
-    """1/`zoom` of the frame a side, around the markings of the state: estimated, else true, else NN_e's; within the frame."""
-    known = [state for state in (estimate.state, truth, estimate.network_state) if state is not None]
-    centre = project(scene, known[0]).reshape(-1, 2).mean(axis=0)
+    """1/`zoom` of the frame a side, within it, around the markings of estimate and truth, or of NN_e's state if there is neither."""
+    known = [np.asarray(state) for state in (estimate.state, truth) if state is not None] or [estimate.network_state]
+    centre = project(scene, np.stack(known)).reshape(-1, 2).mean(axis=0)
     size = np.maximum(np.array(scene.camera.shape) // zoom, 1)
     start = np.clip(np.round(np.nan_to_num(centre[::-1]) - size / 2), 0, np.array(scene.camera.shape) - size).astype(int)
     return View(int(start[0]), int(start[1]), (int(size[0]), int(size[1])), scale)
@@ -171,10 +173,10 @@ def _draw_states(panel: Picture, scene: Scene, view: View, estimate: Estimate, t
 
     if estimate.box is not None:
         hulls = [cv2.convexHull(view.points(points)) for points in box_outlines(scene, estimate.box)]
-        filled = panel.copy()
+        filled = np.zeros_like(panel)
         for hull in hulls:
             cv2.fillPoly(filled, [hull], BOX, cv2.LINE_AA, FRACTION_BITS)
-        panel[:] = cv2.addWeighted(filled, BOX_OPACITY, panel, 1 - BOX_OPACITY, 0)
+        panel[:] = cv2.addWeighted(filled, BOX_LIGHT, panel, 1, 0)
         cv2.polylines(panel, hulls, True, BOX, 1, cv2.LINE_AA, FRACTION_BITS)
     if truth is not None:
         for u, v in view.points(project(scene, truth)).reshape(-1, 2).tolist():

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import operator
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
@@ -76,6 +76,12 @@ class FrameStream:
     def flush(self) -> Iterator[tuple[int, Frame]]:
         """Gives every remaining frame whose window starts at or before the latest event; the stream may be fed further."""
         return self._frames(lambda start: start <= self._latest_us)
+
+    def frames(self, packets: Iterable[NDArray[Any]]) -> Iterator[tuple[int, Frame]]:
+        """Feeds every packet, then flushes: all frames of a recording, one at a time."""
+        for packet in packets:
+            yield from self.feed(packet)
+        yield from self.flush()
 
     def _inside(self, events: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Times and flat pixel numbers of the events on the sensor; counts the others."""

@@ -31,7 +31,7 @@ LARGEST_COORDINATE = 1e6
 SMALLEST_ANGLE_AHEAD_RAD = 1e-6
 """A point closer than this to the plane Z = 0 through the camera's centre counts as behind it: far above float64's error."""
 FOCAL_RANGE_PX = (1.0, 1e6)
-"""Focal lengths for which the margin of `build_model.rounding` covers float64's error."""
+"""Focal lengths for which the margin of `runtime.rounding` covers float64's error."""
 LARGEST_PRINCIPAL_POINT_PX = 32768.0
 """Largest distance of the principal point from the frame's corner, per axis: twice the largest frame, for the same reason."""
 LONGEST_FOUND = 200

@@ -2,9 +2,10 @@
 
     python scripts/fly_approach.py [--model MODEL.onnx] [--frames 100] [--clutter 0.02 | --clutter RECORDING] [--out out/approach]
 
-The aircraft descends from the far and high corner of the domain to the near and low one, its pitch swinging gently. Every frame is
-`I_r(xi) or I_n`: no pixel of the runway fails, so that Theorem A (any clutter) promises a certified box with the truth inside. Prints a
-row a frame and a summary; writes approach.csv, overlay pictures and a contact sheet. Exit code 1 if any frame breaks the promise.
+The aircraft descends from the far and high end of the domain to the near and low one while its pitch swings. Every frame is
+`I_r(xi) or I_n`: no pixel of the runway fails and the camera is the scene's, so that Theorem A promises a certified box with the
+truth inside, whatever the clutter. Prints a row a frame and a summary; writes approach.csv, pictures and a contact sheet. Exit code 1
+if a frame breaks the promise, 2 if something given cannot be used.
 """
 
 from __future__ import annotations
@@ -12,10 +13,11 @@ from __future__ import annotations
 import csv
 import io
 import itertools
+import os
 import sys
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -23,22 +25,25 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 from rich.console import Console
+from rich.progress import track
 from rich.table import Table
 
 from build_model.spatial_filter import spatial_filters
 from runtime import Estimate, Estimator, ModelError, Scene
-from runtime.frames import EventError, FrameStream
+from runtime.draw import Picture, contact_sheet, draw_estimate, draw_runway
+from runtime.frames import FrameStream
 from runtime.image import runway_image
 from runtime.recording import RecordingError, read_events
 from runtime.scene import STATE_NAMES, STATE_UNITS
 
 WINDOW_US = 40_000
 FACE_MARGIN = 0.02
-"""Share of the domain's width, on every axis, that the approach keeps from its faces."""
-PITCH_SWINGS, PITCH_SHARE = 1.5, 0.9
-"""Periods of the pitch on the approach, and its amplitude as a share of what the domain allows."""
+"""Share of the domain's width that the approach keeps from its faces, on every axis."""
+SWING = 0.9
+"""Amplitude of pitch and of lateral position, as a share of what that margin leaves."""
+PITCH_PERIODS = 1.5
 PICTURES = 10
-NARROWEST_TABLE = 140
+NARROWEST_TABLE = 150
 UNSAFE, USER_ERROR = 1, 2
 BUILT_MODEL = Path("out/paper.onnx")
 
@@ -57,80 +62,55 @@ class Step:
 
     @property
     def safe(self) -> bool:
-        """The certificate was kept: there is a box and the truth lies in it."""
+        """The promise is kept: there is a box and the truth lies in it."""
         return self.estimate.box is not None and self.estimate.box.contains(self.truth)
 
     @property
     def error(self) -> float:
-        """2-norm of estimate minus truth over (theta rad, x m, y m, z m), as in the paper; NaN where nothing is certified."""
+        """2-norm of estimate minus truth, rad and m together as in the paper; NaN where nothing is certified."""
         return float("nan") if self.estimate.state is None else float(np.linalg.norm(self.estimate.state - self.truth))
 
 
 def approach_states(scene: Scene, count: int, phase_rad: float) -> NDArray[np.float64]:
-    """`count` states of a descent through the domain, (count, 4): y and z fall from their largest to their smallest values."""
+    """`count` states of a descent through the domain, (count, 4): y and z fall from one end of their range to the other."""
     centre, half = (scene.domain.upper + scene.domain.lower) / 2, (scene.domain.upper - scene.domain.lower) / 2
     along = np.linspace(0, 1, count)
-    descent = np.cos(np.pi * along)
-    swing = PITCH_SHARE * np.sin(2 * np.pi * PITCH_SWINGS * along + phase_rad)
-    drift = PITCH_SHARE * np.sin(2 * np.pi * along)
-    return centre + (1 - 2 * FACE_MARGIN) * half * np.stack([swing, drift, descent, 1 - 2 * along], axis=-1)
+    pitch = SWING * np.sin(2 * np.pi * PITCH_PERIODS * along + phase_rad)
+    drift = SWING * np.sin(2 * np.pi * along)
+    height, distance = np.cos(np.pi * along), 1 - 2 * along
+    return centre + (1 - 2 * FACE_MARGIN) * half * np.stack([pitch, drift, height, distance], axis=-1)
 
 
-def random_clutter(shape: tuple[int, int], density: float, rng: np.random.Generator) -> Frames:
-    """Frames in which each pixel is lit with probability `density`, without end."""
-    while True:
-        yield (rng.random(shape) < density).astype(np.uint8)
-
-
-def recorded_clutter(path: Path, shape: tuple[int, int], console: Console) -> Frames:
-    """The recording's 40 ms frames, over and over. Raises `RecordingError`, also if it holds no event."""
-    for turn in itertools.count():
-        stream = FrameStream(shape, WINDOW_US)
-        count = 0
-        for packet in itertools.chain(read_events(path, shape), [None]):
-            for _, frame in stream.flush() if packet is None else stream.feed(packet):
-                count += 1
-                yield frame
-        if count == 0:
-            raise RecordingError(f"{path}: no events on the sensor; take another recording")
-        if turn == 0:
-            console.print(
-                f"{path}: {count} frames; events late {stream.late_events}, unsorted {stream.unsorted_events}, outside {stream.outside_events}"
-            )
-
-
-def clutter_frames(clutter: str, shape: tuple[int, int], rng: np.random.Generator, console: Console) -> Frames:
-    """Clutter as the option says it: a density, or a recording's path. Raises `RecordingError`."""
+def clutter_frames(clutter: str, shape: tuple[int, int], count: int, rng: np.random.Generator, console: Console) -> Frames:
+    """`count` frames of I_n, as the option says: random pixels of a density, or a recording. Raises `RecordingError`."""
     try:
         density = float(clutter)
     except ValueError:
-        return recorded_clutter(Path(clutter), shape, console)
+        return recorded_clutter(Path(clutter), shape, count, console)
     if not 0 <= density <= 1:
         raise RecordingError(f"--clutter: found {clutter}; give a share of 0 to 1, or the path of a recording")
-    return random_clutter(shape, density, rng)
+    return ((rng.random(shape) < density).astype(np.uint8) for _ in range(count))
+
+
+def recorded_clutter(path: Path, shape: tuple[int, int], count: int, console: Console) -> Frames:
+    """The recording's 40 ms frames, over and over if it has less than `count`. Raises `RecordingError`, also if it has none."""
+    stream = FrameStream(shape, WINDOW_US)
+    # Held as bits: an eighth of the frames' size.
+    held = [np.packbits(frame) for _, frame in itertools.islice(stream.frames(read_events(path, shape)), count)]
+    if not held:
+        raise RecordingError(f"{path}: no event on a sensor of shape {shape}; take another recording")
+    lost = f"{stream.late_events} late, {stream.unsorted_events} unsorted, {stream.outside_events} outside the sensor"
+    console.print(f"{path}: {len(held)} frames of {WINDOW_US // 1000} ms; events {lost}", markup=False)
+    return (np.unpackbits(bits, count=shape[0] * shape[1]).reshape(shape) for bits in itertools.islice(itertools.cycle(held), count))
 
 
 def fly(estimator: Estimator, states: NDArray[np.float64], clutter: Frames) -> Iterator[Step]:
     """Frame by frame: the runway's image or clutter, and its estimate."""
-    for number, (state, noise) in enumerate(zip(states, clutter, strict=False)):
+    for number, (state, noise) in enumerate(zip(states, clutter, strict=True)):
         frame = runway_image(estimator.scene, state) | noise
         start = time.perf_counter()
         estimate = estimator.estimate(frame)
         yield Step(number, state, frame, estimate, 1000 * (time.perf_counter() - start))
-
-
-def flight_table(scene: Scene) -> Table:
-    """The table's head; axes of width 0 are left out."""
-    table = Table(title="approach", title_justify="left", box=None, header_style="bold", pad_edge=False)
-    table.add_column("frame", justify="right")
-    for group in ("true", "est.", "+-"):
-        for axis in free_axes(scene):
-            table.add_column(f"{group} {STATE_NAMES[axis]}", justify="right", no_wrap=True)
-    for name in ("inside", "fallback", "face"):
-        table.add_column(name)
-    for name in ("cell", "passing", "ms"):
-        table.add_column(name, justify="right")
-    return table
 
 
 def free_axes(scene: Scene) -> list[int]:
@@ -138,67 +118,127 @@ def free_axes(scene: Scene) -> list[int]:
     return np.flatnonzero(scene.domain.upper > scene.domain.lower).tolist()
 
 
-def flight_row(scene: Scene, step: Step) -> list[str]:
-    """What `flight_table` shows of one frame."""
-    estimate = step.estimate
-    half_widths = None if estimate.box is None else estimate.box.half_widths
-    numbers = [
-        "-" if state is None else f"{state[axis]:.4f}" for state in (step.truth, estimate.state, half_widths) for axis in free_axes(scene)
-    ]
-    answers = ["yes" if step.safe else "[bold red]NO", "yes" if estimate.used_fallback else "no", "yes" if estimate.touches_boundary else "no"]
-    return [str(step.number), *numbers, *answers, str(estimate.cell), str(len(estimate.passing)), f"{step.milliseconds:.2f}"]
-
-
-def csv_row(step: Step) -> dict[str, object]:
-    """One line of approach.csv; empty where nothing is certified."""
-    estimate = step.estimate
-    box = estimate.box
-    states = {
-        "truth": step.truth,
-        "estimate": estimate.state,
-        "network": estimate.network_state,
-        "lower": None if box is None else box.lower,
-        "upper": None if box is None else box.upper,
-    }
-    return {
-        "frame": step.number,
-        **{
-            f"{kind}_{name}_{unit}": "" if state is None else repr(float(state[axis]))
-            for kind, state in states.items()
-            for axis, (name, unit) in enumerate(zip(STATE_NAMES, STATE_UNITS, strict=True))
-        },
-        "outcome": estimate.outcome.value,
-        "truth_inside": step.safe,
-        "fallback": estimate.used_fallback,
-        "touches_boundary": estimate.touches_boundary,
-        "cell": estimate.cell,
-        "passing": len(estimate.passing),
-        "mismatch": estimate.mismatch,
-        "error_2norm": "" if box is None else step.error,
-        "lit_share": step.frame.mean(),
-        "milliseconds": step.milliseconds,
-    }
-
-
-def summary_table(scene: Scene, rows: list[dict[str, object]], steps_half_widths: NDArray[np.float64]) -> Table:
-    """Counts and medians over the approach."""
-    column = {name: np.array([row[name] for row in rows if row[name] != ""]) for name in rows[0]}
-    certified = int(np.sum(column["outcome"] == "certified"))
-    table = Table(title="summary", title_justify="left", show_header=False, box=None, pad_edge=False)
-    lines = {
-        "frames": str(len(rows)),
-        "certified": str(certified),
-        "violations (no box, or truth outside)": str(int(np.sum(~column["truth_inside"]))),
-        "lit share of the frame, median": f"{np.median(column['lit_share']):.2%}",
-        "fallback to the box's centre": str(int(column["fallback"].sum())),
-        "box reaches a face of the domain": str(int(column["touches_boundary"].sum())),
-        "cells passing, median": f"{np.median(column['passing']):g} of {scene.domain.cell_count}",
-        "estimate, median ms": f"{np.median(column['milliseconds']):.2f}",
-    }
-    if certified:
-        half_widths = np.median(steps_half_widths, axis=0)
-        lines["error (2-norm of rad and m), median / 95 %"] = " / ".join(f"{np.quantile(column['error_2norm'], q):.4f}" for q in (0.5, 0.95))
-        lines["box half-width, median"] = ", ".join(f"{STATE_NAMES[axis]} {half_widths[axis]:.4f}" for axis in free_axes(scene))
-    for name, value in lines.items():
-        table.add_row(name, value)
+def flight_table(scene: Scene, steps: Sequence[Step]) -> Table:
+    """A row a frame; axes of width 0 are left out."""
+    table = Table(title="approach", title_justify="left", box=None, pad_edge=False)
+    names = [f"{kind} {STATE_NAMES[axis]}" for kind in ("true", "est.", "+-") for axis in free_axes(scene)]
+    for name in ("frame", *names, "inside", "fallback", "at face", "cell", "passing", "ms"):
+        table.add_column(name, justify="right", no_wrap=True)
+    for step in steps:
+        estimate = step.estimate
+        states = step.truth, estimate.state, None if estimate.box is None else estimate.box.half_widths
+        numbers = ["-" if state is None else f"{state[axis]:.4f}" for state in states for axis in free_axes(scene)]
+        answers = ["yes" if answer else "no" for answer in (estimate.used_fallback, estimate.touches_boundary)]
+        counts = [str(estimate.cell), str(len(estimate.passing)), f"{step.milliseconds:.2f}"]
+        table.add_row(str(step.number), *numbers, "yes" if step.safe else "[bold red]NO", *answers, *counts)
     return table
+
+
+def summary_table(scene: Scene, steps: Sequence[Step], lit_shares: Sequence[float]) -> Table:
+    """Counts, and medians over the frames."""
+    estimates = [step.estimate for step in steps]
+    table = Table(title="summary", title_justify="left", show_header=False, box=None, pad_edge=False)
+    table.add_row("frames", str(len(steps)))
+    table.add_row("certified", str(sum(estimate.certified for estimate in estimates)))
+    table.add_row("violations (no box, or truth outside)", str(sum(not step.safe for step in steps)))
+    if boxes := [estimate.box for estimate in estimates if estimate.box is not None]:
+        median, high = np.nanquantile([step.error for step in steps], (0.5, 0.95))
+        half_widths = np.median([box.half_widths for box in boxes], axis=0)
+        table.add_row("error, 2-norm of rad and m, median / 95 %", f"{median:.4f} / {high:.4f}")
+        table.add_row(
+            "box half-width, median", ", ".join(f"{STATE_NAMES[a]} {half_widths[a]:.4f} {STATE_UNITS[a]}" for a in free_axes(scene))
+        )
+    table.add_row("box reaches a face of the domain", str(sum(estimate.touches_boundary for estimate in estimates)))
+    table.add_row("fallback to the box's centre", str(sum(estimate.used_fallback for estimate in estimates)))
+    table.add_row("cells passing, median", f"{np.median([len(e.passing) for e in estimates]):g} of {scene.domain.cell_count}")
+    table.add_row("lit share of a frame, median", f"{np.median(lit_shares):.2%}")
+    table.add_row("estimate, median", f"{np.median([step.milliseconds for step in steps]):.2f} ms")
+    return table
+
+
+def csv_text(steps: Sequence[Step], lit_shares: Sequence[float]) -> str:
+    """approach.csv: a line a frame, every state with its units; empty where nothing is certified."""
+    kinds = ("truth", "estimate", "network", "lower", "upper")
+    states = [f"{kind}_{name}_{unit}" for kind in kinds for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True)]
+    answers = ["outcome", "truth_inside", "fallback", "touches_boundary", "cell", "passing", "mismatch"]
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["frame", *states, *answers, "error_2norm", "lit_share", "milliseconds"])
+    for step, lit_share in zip(steps, lit_shares, strict=True):
+        e = step.estimate
+        sides = (None, None) if e.box is None else (e.box.lower, e.box.upper)
+        numbers = [[""] * 4 if state is None else state.tolist() for state in (step.truth, e.state, e.network_state, *sides)]
+        outcome = [e.outcome.value, step.safe, e.used_fallback, e.touches_boundary, e.cell, len(e.passing), e.mismatch]
+        writer.writerow(
+            [step.number, *itertools.chain(*numbers), *outcome, step.error if e.certified else "", lit_share, step.milliseconds]
+        )
+    return text.getvalue()
+
+
+def write_whole(path: Path, content: bytes) -> None:
+    """Writes beside `path` and renames: what was there stays until the new file is whole."""
+    part = path.with_name(f"{path.name}.part")
+    part.write_bytes(content)
+    os.replace(part, path)
+
+
+def png(picture: Picture) -> bytes:
+    """The picture as a PNG file."""
+    import cv2
+
+    return cv2.imencode(".png", picture)[1].tobytes()
+
+
+def run(model: Path | None, frames: int, clutter: str, out: Path, seed: int, console: Console) -> bool:
+    """Flies, prints and writes; True if every certificate was kept. Raises `ModelError`, `RecordingError`, OSError."""
+    estimator = Estimator.load(model, extra_budget=-1)
+    scene, rng = estimator.scene, np.random.default_rng(seed)
+    states = approach_states(scene, frames, rng.uniform(0, 2 * np.pi))
+    noise = clutter_frames(clutter, scene.camera.shape, frames, rng, console)
+    masks = spatial_filters(scene)
+    pictured = set(np.linspace(0, frames - 1, min(PICTURES, frames)).round().astype(int).tolist())
+    out.mkdir(parents=True, exist_ok=True)
+    steps, lit_shares, small = [], [], []
+    for step in track(fly(estimator, states, noise), "flying", total=frames, console=console, transient=True):
+        lit_shares.append(float(step.frame.mean()))
+        if step.number in pictured:
+            shown = {"mask": masks[step.estimate.cell], "truth": step.truth, "title": f"frame {step.number}"}
+            write_whole(out / f"overlay_{len(small)}.png", png(draw_estimate(scene, step.frame, step.estimate, **shown)))
+            small.append(draw_runway(scene, step.frame, step.estimate, **shown))
+        # An approach may be long: its frames are not kept.
+        nothing = np.empty((0, 0), dtype=np.uint8)
+        steps.append(replace(step, frame=nothing, estimate=replace(step.estimate, filtered=nothing)))
+    write_whole(out / "contact_sheet.png", png(contact_sheet(small, columns=5)))
+    write_whole(out / "approach.csv", csv_text(steps, lit_shares).encode())
+    console.print(flight_table(scene, steps), summary_table(scene, steps, lit_shares))
+    lines = [
+        f"written: {out}/approach.csv, {out}/contact_sheet.png and {len(small)} overlays",
+        "assumed:",
+        *estimator.metadata["assumptions"],
+    ]
+    console.print(*lines, sep="\n", markup=False, highlight=False)
+    return all(step.safe for step in steps)
+
+
+def fly_approach(
+    model: Annotated[Path | None, typer.Option(help="Model; by default out/paper.onnx, else the one of models/.")] = None,
+    frames: Annotated[int, typer.Option(min=1, help="Frames of the approach.")] = 100,
+    clutter: Annotated[str, typer.Option(help="Share of lit pixels, or a recording whose 40 ms frames are cycled.")] = "0.02",
+    out: Annotated[Path, typer.Option(help="Folder for the table and the pictures.")] = Path("out/approach"),
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the clutter and of the pitch's phase.")] = 0,
+) -> None:
+    """Fly a simulated approach with a known truth and check every certificate."""
+    console = Console()
+    if not console.is_terminal:
+        console.width = NARROWEST_TABLE
+    try:
+        kept = run(model or (BUILT_MODEL if BUILT_MODEL.is_file() else None), frames, clutter, out, seed, console)
+    except (ModelError, RecordingError, OSError) as error:
+        print(error, file=sys.stderr)
+        raise typer.Exit(USER_ERROR) from None
+    if not kept:
+        raise typer.Exit(UNSAFE)
+
+
+if __name__ == "__main__":
+    typer.run(fly_approach)

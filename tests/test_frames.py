@@ -48,8 +48,7 @@ def packets(events: NDArray, cuts: list[int]) -> list[NDArray]:
 
 
 def run(stream: FrameStream, fed: list[NDArray]) -> list[tuple[int, list[list[int]]]]:
-    frames = [pair for packet in fed for pair in stream.feed(packet)] + list(stream.flush())
-    return [(start, frame.tolist()) for start, frame in frames]
+    return [(start, frame.tolist()) for start, frame in stream.frames(fed)]
 
 
 @given(rows=st.lists(inside, max_size=30), size=sizes, cuts=st.lists(st.integers(0, 40), max_size=8))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import runpy
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from rich.progress import Progress
 
 from build_model.partition import partition
 from build_model.pixel_mask import Window
@@ -31,11 +33,11 @@ from build_model.reachability import (
     snap_outward,
     zeta_bounds,
 )
-from build_model.rounding import OUTWARD_PX
+from runtime.rounding import OUTWARD_PX
 from build_model.runway_network import RunwayNetwork, pixel_weights
 from runtime.camera import project
 from runtime.image import runway_image
-from runtime.scene import Axis, Bank, Camera, Domain, Marking, Runway, Scene
+from runtime.scene import Axis, Bank, Camera, Domain, Marking, Runway, Scene, Tolerance
 
 PAPER = Scene.load(Path(__file__).parent.parent / "models" / "paper.toml")
 CELLS = partition(PAPER)
@@ -73,9 +75,8 @@ def parabola_bounds(*, alpha_inside: bool) -> tuple[float, float]:
     """Proposition 2 on x^2 over [-1, 2], with J = [-2, 4]: as printed, and corrected."""
     low, high, jacobian_low, jacobian_high = -1.0, 2.0, -2.0, 4.0
     if not alpha_inside:
-        bounds = mixed_monotone_bounds(
-            np.square, *(np.array([[j]]) for j in (jacobian_low, jacobian_high)), np.array([low]), np.array([high])
-        )
+        jacobian = np.array([[jacobian_low]]), np.array([[jacobian_high]])
+        bounds = mixed_monotone_bounds(np.square, jacobian[0], jacobian[1], np.array([low]), np.array([high]))
         return bounds[0].item(), bounds[1].item()
     alpha = min(0.0, jacobian_low)
     return (low - alpha * (low - high)) ** 2, (high + alpha * (low - high)) ** 2
@@ -194,14 +195,14 @@ def test_the_closed_form_is_tightest_and_attained(box: tuple[Floats, Floats]) ->
 
 
 def test_corners_alone_miss_columns() -> None:
-    """u of an end is not monotone in theta where the end crosses row v0: in 9 of the paper's cells, by up to 0.055 px."""
+    """u of an end is not monotone in theta where the end crosses row v0: in 9 of the paper's cells, by up to 0.030 px."""
     low, high = zeta_bounds(PAPER, CELLS.lower, CELLS.upper, Method.CLOSED_FORM)
     missed = np.zeros(len(CELLS))
     for cell, box in enumerate(zip(CELLS.lower, CELLS.upper, strict=True)):
         zeta = zeta_of(PAPER, np.array(list(itertools.product(*zip(*box, strict=True)))))
         missed[cell] = max((zeta.min(axis=0) - low[cell]).max(), (high[cell] - zeta.max(axis=0)).max())
     assert (missed > 10 * OUTWARD_PX).sum() == 9
-    assert 0.05 < missed.max() < 0.06
+    assert 0.029 < missed.max() < 0.031
 
 
 def test_a_box_with_the_runway_beside_the_camera_is_refused() -> None:
@@ -262,7 +263,7 @@ def test_orientation_is_exact_at_its_16_corners() -> None:
     width = [(bound[1] - bound[0])[:, orientations].mean() for bound in (exact, mixed, plain)]
     assert width[1] < 1.5 * width[0]
     assert width[2] > 5 * width[0]
-    assert (mixed[1] - exact[1] == 0)[:, orientations].mean() > 0.3
+    assert (mixed[1][:, orientations] == exact[1][:, orientations]).mean() > 0.3
 
 
 def test_the_printed_jacobian_bounds_light_every_pixel() -> None:
@@ -278,14 +279,20 @@ def test_the_printed_jacobian_bounds_light_every_pixel() -> None:
 
 
 def may_light_all(scene: Scene, lower: Floats, upper: Floats, method: Method, count: int = 300, **options: bool) -> tuple[int, int]:
-    """Asserts that the mask holds every sampled image; returns the pixels of the samples' union and of the mask."""
+    """Asserts that the mask holds every sampled image; returns the pixels of the samples' union and of the mask, over the part of the
+    frame within 20 px of that union."""
     union = runway_image(scene, states_in(lower, upper, count)).any(axis=0)
     rows, columns = np.nonzero(union)
-    window = Window(int(rows.min()), int(rows.max()) + 1, int(columns.min()), int(columns.max()) + 1)
-    mask = possible_pixels(scene, lower, upper, method, None if not options else window, **options)
-    lit = union[window.slices] if options else union
-    assert not (lit & ~mask).any()
-    return int(lit.sum()), int(mask.sum())
+    (height, width), margin = scene.camera.shape, 20
+    window = Window(
+        max(int(rows.min()) - margin, 0),
+        min(int(rows.max()) + margin, height),
+        max(int(columns.min()) - margin, 0),
+        min(int(columns.max()) + margin, width),
+    )
+    mask = possible_pixels(scene, lower, upper, method, window, **options)
+    assert not (union[window.slices] & ~mask).any()
+    return int(union.sum()), int(mask.sum())
 
 
 @pytest.mark.parametrize("method", Method)
@@ -297,13 +304,13 @@ def test_masks_contain_the_images_of_a_cell(method: Method, cell: int) -> None:
 
 @pytest.mark.parametrize("method", Method)
 def test_masks_of_a_small_box_are_tight(method: Method) -> None:
-    """Over a box of a tenth of a millimetre the masks come close to the union itself; NN_r alone needs no help there."""
+    """Over a box of a tenth of a millimetre the masks come close to the union itself, and NN_r alone needs no help for it. Interval
+    arithmetic stays several pixels wide: det is a difference of two numbers near 70,000 px^2."""
     centre = np.array([0.61, 0.0, 0.93, 1.71])
     half = np.array([1e-4, 0, 1e-4, 1e-4])
-    lit, mask = may_light_all(PAPER, centre - half, centre + half, method)
-    assert mask <= 1.25 * lit
-    lit, mask = may_light_all(PAPER, centre - half, centre + half, method, between_ends=False)
-    assert mask <= 1.25 * lit
+    for between_ends, of_intervals in ((True, 4), (False, 12)):
+        lit, mask = may_light_all(PAPER, centre - half, centre + half, method, between_ends=between_ends)
+        assert mask <= (of_intervals if method is Method.INTERVALS else 1.25) * lit
 
 
 def test_without_the_ends_the_network_lights_whole_rows() -> None:
@@ -317,12 +324,12 @@ def test_without_the_ends_the_network_lights_whole_rows() -> None:
 @pytest.mark.parametrize("method", Method)
 def test_masks_contain_ties(method: Method) -> None:
     """Markings on column borders, through pixel corners and with ends on integer rows, where NN_r itself lights nothing."""
-    camera = Camera(width=320, height=320, focal_length_m=1.0, pixel_pitch_m=2.0**-9, principal_point=(32.0, 32.0))
+    camera = Camera(width=80, height=80, focal_length_m=1.0, pixel_pitch_m=2.0**-7, principal_point=(8.0, 8.0))
     domain = Domain(Axis((0.0,), 0.1), Axis((0.0,), 0.0), Axis((0.5,), 0.1), Axis((1.0,), 0.1))
     markings = tuple(Marking(str(x), x, 0.0, 1.0) for x in (0.0, 0.125, 0.25, 0.5))
     scene = Scene(camera, Runway(markings), domain, Bank(1, 1, 0.5))
     tie = np.array([0.0, 0.0, 0.5, 1.0])
-    assert may_light_all(scene, tie, tie, method)[0] > 300
+    assert may_light_all(scene, tie, tie, method)[0] > 100
     for half in ([0, 0.01, 0, 0], [0, 0, 2.0**-7, 0], [1e-3, 0, 0, 2.0**-6]):
         may_light_all(scene, tie - half, tie + half, method, count=50)
         may_light_all(scene, tie, tie + np.array(half), method, count=50)
@@ -343,6 +350,36 @@ def test_masks_are_clipped_to_frame_and_window(method: Method) -> None:
     window = Window(5, 30, 10, 50)
     np.testing.assert_array_equal(possible_pixels(scene, *box, method, window), mask[window.slices])
     assert possible_pixels(scene, *box, method, Window(3, 3, 0, 60)).shape == (0, 60)
+
+
+# The script that compares the filters
+
+SCRIPT = runpy.run_path(str(Path(__file__).parent.parent / "scripts" / "compare_spatial_filters.py"))
+
+
+def test_the_sampled_union_is_that_of_the_images() -> None:
+    camera = dataclasses.replace(PAPER.camera, width=80, height=60)  # cuts the runway off at all sides
+    scene = dataclasses.replace(PAPER, camera=camera)
+    box = CELLS.lower[4] - [0, 0.03, 0, 0], CELLS.upper[4] + [0, 0.03, 0, 0]
+    batches = []
+    union = SCRIPT["sampled_union"](scene, *box, 700, np.random.default_rng(9), lambda: batches.append(1))
+    rng = np.random.default_rng(9)
+    states = np.concatenate([rng.uniform(*box, (count, 4)) for count in (500, 200)])
+    np.testing.assert_array_equal(union, runway_image(scene, states).any(axis=0))
+    assert len(batches) == 2
+    assert 0.1 < union.mean() < 0.9
+
+
+def test_the_comparison_orders_the_filters() -> None:
+    """No filter lacks a sampled pixel; the build's S is closest, and intervals are widest."""
+    domain = Domain(Axis((0.6,), 0.1), Axis((0.0,), 0.0), Axis((0.9,), 0.1), Axis((1.7,), 0.1))
+    scene = dataclasses.replace(PAPER, domain=domain, tolerance=Tolerance(line_px=2))
+    counts = SCRIPT["compare"](scene, 2000, 0, whole_frame=False, progress=Progress(disable=True))
+    sampled, build, mixed, intervals, closed = counts[0]
+    assert sampled <= build < closed <= mixed < intervals
+    assert build < 1.2 * sampled
+    rows = SCRIPT["table_of"](counts).row_count
+    assert rows == 2
 
 
 # The paper's bound
