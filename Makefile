@@ -30,14 +30,15 @@ types: $(INSTALLED)
 	$(BIN)/pyright
 
 demo: out/paper.onnx
-	$(BIN)/python scripts/fly_approach.py $<
+	$(BIN)/python scripts/fly_approach.py --model $<
 
 out/paper.onnx: models/paper.toml constraints.txt $(SOURCES) | $(INSTALLED)
 	mkdir -p $(@D)
 	$(BIN)/export-model $< -o $@
 
 evidence: out/paper.onnx
-	$(BIN)/python scripts/coverage.py $< --long
+	$(BIN)/python scripts/coverage.py $< --states 20000 -o out/coverage.json
+	$(BIN)/python -m pytest --hypothesis-profile=long
 
 clean:
 	rm -rf .venv out dist build .pytest_cache .ruff_cache .hypothesis

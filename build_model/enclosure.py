@@ -10,26 +10,31 @@ from numpy.typing import NDArray
 
 from runtime.rounding import above, below, first_crossed, first_touched, inverted, last_crossed, last_touched
 from runtime.scene import Camera, Scene
-from runtime.state_set import Floats, StateSet, angle_below_axis, column_range, end_rows, scale_between
+from runtime.state_set import Floats, StateSet, column_range, end_rows, fall, reach, scale_between, tangent_of_row
 
 Columns = tuple[NDArray[np.int64], NDArray[np.int64]]
 """First and last column a marking lights in a row, two arrays (sets, markings, height); none where last < first."""
 
 
 def _scale_at_distance(camera: Camera, theta: Floats, d: Floats, start: Floats, stop: Floats) -> tuple[Floats, Floats]:
-    """Range of g over rows [start, stop], (sets, rows) each, of ground d (sets, 2) ahead: F cos(psi) / (d cos(phi)), psi in [0, pi/2].
+    """Range of g over rows with tangents [start, stop], (sets, rows) each, of ground d (sets, 2) ahead that is seen there.
 
-    F (cos(theta) - sin(theta) tan(phi)) / d is affine in the row and falls in theta.
+    F (cos(theta) - t sin(theta)) / d is affine in t, and falls in theta as long as psi >= 0; it is at most F sqrt(1 + t^2) / d.
     """
-    ends = [angle_below_axis(camera, row) for row in (start, stop)]
-    low = [np.maximum(np.cos(theta[:, 1:] + phi), 0) / np.cos(phi) for phi in ends]
-    high = [np.cos(np.maximum(theta[:, :1] + phi, 0)) / np.cos(phi) for phi in ends]
-    return camera.focal_px * np.minimum(*low) / d[:, 1:], camera.focal_px * np.maximum(*high) / d[:, :1]
+    low = np.minimum(*(np.maximum(reach(theta[:, 1:], tangent), 0) for tangent in (start, stop)))
+    high = np.maximum(*(_farthest_reach(theta[:, :1], tangent) for tangent in (start, stop)))
+    return camera.focal_px * low / d[:, 1:], camera.focal_px * high / d[:, :1]
 
 
-def _altitude(psi: Floats, d: Floats) -> Floats:
+def _farthest_reach(theta: Floats, tangent: Floats) -> Floats:
+    """Largest cos(theta') - t sin(theta') over theta' >= theta with psi' >= 0."""
+    return np.where(fall(theta, tangent) >= 0, reach(theta, tangent), np.sqrt(1 + tangent**2))
+
+
+def _altitude(theta: Floats, tangent: Floats, d: Floats) -> Floats:
     """y = d tan(psi) of the ground seen at psi below the horizon, d ahead; 0 above the horizon, infinite from straight down on."""
-    return np.where(psi < np.pi / 2, d * np.tan(np.clip(psi, 0, np.pi / 2)), np.inf)
+    falls, reaches = fall(theta, tangent), reach(theta, tangent)
+    return np.where(falls <= 0, 0.0, np.where(reaches > 0, d * falls / np.where(reaches > 0, reaches, 1.0), np.inf))
 
 
 def columns_that_may_be_lit(scene: Scene, sets: StateSet) -> Columns:
@@ -46,10 +51,9 @@ def columns_that_may_be_lit(scene: Scene, sets: StateSet) -> Columns:
         near, far = marking.ends_z_m
         start = np.maximum(top, below(end_rows(camera, sets, far)[0])[:, None])
         stop = np.minimum(top + 1, above(end_rows(camera, sets, near)[1])[:, None])
-        y_low = _altitude(sets.theta[:, :1] + angle_below_axis(camera, start), d[:, :1])
-        y_high = _altitude(sets.theta[:, 1:] + angle_below_axis(camera, stop), d[:, 1:])
-        by_state = scale_between(camera, sets, sets.y[:, None, :], start, stop)
-        by_distance = _scale_at_distance(camera, sets.theta, d, start, stop)
+        first, last = tangent_of_row(camera, start), tangent_of_row(camera, stop)
+        y_low, y_high = _altitude(sets.theta[:, :1], first, d[:, :1]), _altitude(sets.theta[:, 1:], last, d[:, 1:])
+        by_state, by_distance = scale_between(camera, sets, first, last), _scale_at_distance(camera, sets.theta, d, first, last)
         scale = np.maximum(by_state[0], by_distance[0]), np.minimum(by_state[1], by_distance[1])
         low, high = column_range(camera, marking.x_m - sets.x[:, ::-1], scale)
         absent = (start > stop) | inverted(y_low, sets.y[:, 1:]) | inverted(sets.y[:, :1], y_high) | inverted(*scale)
@@ -72,7 +76,8 @@ def columns_that_must_be_lit(scene: Scene, sets: StateSet) -> Columns:
         start = np.maximum(top, above(end_rows(camera, sets, far)[1])[:, None])
         stop = np.minimum(top + 1, below(end_rows(camera, sets, near)[0])[:, None])
         across = marking.x_m - sets.x[:, ::-1]
-        ends = [column_range(camera, across, scale_between(camera, sets, sets.y[:, None, :], row, row)) for row in (start, stop)]
+        tangents = (tangent_of_row(camera, row) for row in (start, stop))
+        ends = [column_range(camera, across, scale_between(camera, sets, tangent, tangent)) for tangent in tangents]
         first = first_crossed(np.minimum(ends[0][1], ends[1][1]))
         last = last_crossed(np.maximum(ends[0][0], ends[1][0]))
         absent = start >= stop

@@ -24,8 +24,8 @@ from build_model.enclosure import columns_that_may_be_lit, columns_that_must_be_
 from build_model.pixel_mask import Runs, Window, clip_and_widen, paint, runs_of
 from build_model.spatial_filter import reference_row, sliced, spatial_filter
 from runtime.rounding import float32_above, float32_below, inverted
-from runtime.scene import Scene, SceneError
-from runtime.state_set import StateSet, contract, scale_range
+from runtime.scene import Camera, Scene, SceneError
+from runtime.state_set import StateSet, contract, scale_range, tangent_of_row
 
 SCALE_STEP = 2.0**-10
 """Bins of the scale have borders on multiples of this, px per metre, so that they do not depend on the machine's libm."""
@@ -47,11 +47,11 @@ class LineBoxes:
     def __len__(self) -> int:
         return len(self.lower)
 
-    def states(self, cell_lower: NDArray[np.float64], cell_upper: NDArray[np.float64]) -> StateSet:
+    def states(self, camera: Camera, cell_lower: NDArray[np.float64], cell_upper: NDArray[np.float64]) -> StateSet:
         """The entries of the cell [cell_lower, cell_upper], (4,) each, as sets of states, not yet contracted."""
         theta, x, scale, z = (np.stack([self.lower[:, axis], self.upper[:, axis]], axis=-1) for axis in range(4))
         y = np.broadcast_to([cell_lower[2], cell_upper[2]], theta.shape)
-        return StateSet(theta, x, y, z, scale, self.reference_row)
+        return StateSet(theta, x, y, z, scale, tangent_of_row(camera, self.reference_row))
 
 
 @dataclass(frozen=True)
@@ -87,7 +87,7 @@ def line_boxes(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float
         low, high = lower.copy(), upper.copy()
         (low[0], high[0]), (low[3], high[3]) = theta, z
         row = reference_row(scene.camera, low, high, scene.runway.ends_z_m.mean())
-        scale = np.array(scale_range(scene.camera, theta, np.array([lower[2], upper[2]]), np.array(row)))
+        scale = np.array(scale_range(scene.camera, theta, np.array([lower[2], upper[2]]), tangent_of_row(scene.camera, row)))
         lateral_bins = max(1, math.ceil((upper[1] - lower[1]) * scale[1] / bank.lateral_px))
         for x in sliced(lower[1], upper[1], lateral_bins):
             boxes += [(theta, x, bin_, z, row) for bin_ in _scale_bins(scene, x, scale)]
@@ -110,7 +110,7 @@ def cell_bank(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float6
     it would pass on any frame.
     """
     lines = line_boxes(scene, lower, upper)
-    states = contract(scene.camera, lines.states(lower, upper))
+    states = contract(scene.camera, lines.states(scene.camera, lower, upper))
     kept = ~(inverted(*states.theta.T) | inverted(*states.y.T))
     lines, states = LineBoxes(lines.lower[kept], lines.upper[kept], lines.reference_row[kept]), states[kept]
     spatial, window = spatial_filter(scene, lower, upper)

@@ -14,6 +14,7 @@ lights a half-open pixel by touching its border crosses the pixel's inside after
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -415,12 +416,7 @@ def mixed_monotone_layers(network: Sequence[Layer], lower: Floats, upper: Floats
     boxes, partials = [(lower, upper)], list[_PartialNetwork]()
     for layer in network:
         partials = [partial.then(layer) for partial in [*partials, _PartialNetwork.start(boxes[-1])]]
-        box = partials[0].reached
-        for partial in partials[1:]:
-            box = _intersect(box, partial.reached)
-        first = partials[0]  # from zeta: all that it reaches lies in the intersection too
-        partials[0] = _PartialNetwork(first.source, first.maps, first.jacobian, box)
-        boxes.append(box)
+        boxes.append(functools.reduce(_intersect, (partial.reached for partial in partials)))
     return boxes[1:]
 
 

@@ -14,7 +14,7 @@ from build_model.partition import partition
 from build_model.pixel_mask import Bits, Window, clip_and_widen, paint, window_of
 from runtime.camera import row_of_point
 from runtime.scene import Camera, Scene, SceneError
-from runtime.state_set import StateSet, contract, scale_range
+from runtime.state_set import StateSet, contract, scale_range, tangent_of_row
 
 SLICES = 32
 """Slices of theta a cell. Eight times as many take less than one pixel in 100 from S of the paper's cells."""
@@ -41,9 +41,9 @@ def slice_cell(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float
     camera = scene.camera
     theta = sliced(lower[0], upper[0], slices)
     rest = [np.broadcast_to([low, high], (slices, 2)) for low, high in zip(lower[1:], upper[1:], strict=True)]
-    row = np.full(slices, reference_row(camera, lower, upper, scene.runway.ends_z_m.mean()))
-    scale = np.stack(scale_range(camera, theta, rest[1], row), axis=-1)
-    return contract(camera, StateSet(theta, rest[0], rest[1], rest[2], scale, row))
+    tangent = np.full(slices, tangent_of_row(camera, reference_row(camera, lower, upper, scene.runway.ends_z_m.mean())))
+    scale = np.stack(scale_range(camera, theta, rest[1], tangent), axis=-1)
+    return contract(camera, StateSet(theta, rest[0], rest[1], rest[2], scale, tangent))
 
 
 def spatial_filter(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> tuple[Bits, Window]:

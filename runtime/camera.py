@@ -54,8 +54,12 @@ def project(scene: Scene, states: ArrayLike) -> Floats:
 
 
 def row_of_point(camera: Camera, theta: ArrayLike, y: ArrayLike, d: ArrayLike) -> Floats:
-    """Row v0 + F tan(atan2(y, d) - theta) of a ground point d metres ahead, px. Up in y, down in d and in theta."""
-    return camera.v0 + camera.focal_px * np.tan(np.arctan2(y, d) - np.asarray(theta))
+    """Row v0 + F tan(beta - theta), beta = atan2(y, d), of a ground point d metres ahead, px. Up in y, down in d and in theta.
+
+    Evaluated as F (y cos - d sin) / (y sin + d cos), whose terms every libm agrees on to the last places.
+    """
+    cosine, sine, y, d = np.cos(theta), np.sin(theta), np.asarray(y), np.asarray(d)
+    return camera.v0 + camera.focal_px * (y * cosine - d * sine) / (y * sine + d * cosine)
 
 
 def ground_scale(camera: Camera, theta: ArrayLike, y: ArrayLike, v: ArrayLike) -> Floats:

@@ -18,13 +18,18 @@ import numpy as np
 import onnxruntime
 from numpy.typing import ArrayLike, NDArray
 
+from runtime.image import dilated
 from runtime.model_file import ModelError, ModelFile, parse_model
+from runtime.refine import STATE_MARGIN, Refiner, connected_parts
 from runtime.scene import STATE_NAMES, Scene, SceneError
+from runtime.state_set import StateSet, tangent_of_row
 
 PACKAGED_MODELS = (Path(__file__).parent / "models", Path(__file__).parents[1] / "models")
 """Where the paper's model lies: in a wheel beside this file, in a checkout at the top."""
 LOG_ERRORS_ONLY = 3
-OUTPUTS = ("cell", "support", "mismatch", "cell_lower", "cell_upper", "filtered", "network_state")
+OUTPUTS = ("cell", "support", "mismatch", "passes", "cell_lower", "cell_upper", "filtered", "network_state")
+ENTRY_TENSORS = ("state_lower", "state_upper", "line_lower", "line_upper", "reference_row")
+"""Initialisers that hold every entry as a box of states and of line coordinates."""
 
 
 class FrameError(ValueError):
@@ -95,6 +100,8 @@ class Estimate:
     """Smallest missed + extra of `cell`."""
     filtered: NDArray[np.uint8]
     """The frame within the spatial masks of the passing cells: keeps every lit pixel of the runway."""
+    regions: tuple[Box, ...]
+    """Connected parts of what is consistent, each in its box; more than one is an ambiguity. One without refinement."""
     touches_boundary: bool
     """The box reaches a face of the domain: it holds the state only if the aircraft is in the domain."""
 
@@ -118,6 +125,8 @@ class Estimator:
         self._session = self._open(model.content, name, threads)
         self._domain_lower, self._domain_upper = self.scene.domain.lower, self.scene.domain.upper
         self._fixed = self._domain_lower == self._domain_upper
+        self._entries = _Entries.of(self.scene, model.tensors)
+        self._refiner = Refiner(self.scene, int(self._budgets["missed_budget"]))
 
     @classmethod
     def load(
@@ -139,22 +148,28 @@ class Estimator:
             content = source.read_bytes()
         except OSError as error:
             raise ModelError(f"{source}: cannot be read ({error.strerror}); give the path of a model that export-model wrote") from error
-        model = parse_model(content, str(source))
+        model = parse_model(content, str(source), ENTRY_TENSORS)
         if sha256 is not None and sha256.lower() != model.sha256:
             raise ModelError(f"{source}: sha256 is {model.sha256}, the caller trusts {sha256}; take the file from its source again")
         return cls(model, str(source), threads, missed_budget, extra_budget)
 
-    def estimate(self, frame: NDArray, proposal: ArrayLike | None = None) -> Estimate:
+    def estimate(self, frame: NDArray, proposal: ArrayLike | None = None, refine: bool = True) -> Estimate:
         """State and certified box of one frame.
 
         `frame`: (height, width), bool, or uint8 of {0, 1}. `proposal`: a state (4,) from elsewhere to be checked in place of NN_e's.
-        Raises `FrameError` for any other frame and ValueError for a proposal of another shape.
+        `refine`: contract the passing entries to what the frame can tell (`runtime.refine`); without it, the box is their hull. Raises
+        `FrameError` for any other frame and ValueError for a proposal of another shape.
         """
-        results = self._session.run(OUTPUTS, {"frame": self._checked_frame(frame), **self._budgets})
-        cell, support, mismatch, cell_lower, cell_upper, filtered, network_state = results
+        pixels = self._checked_frame(frame)
+        results = self._session.run(OUTPUTS, {"frame": pixels, **self._budgets})
+        cell, support, mismatch, passes, cell_lower, cell_upper, filtered, network_state = results
         network = np.where(self._fixed, self._domain_lower, network_state)
         passing = np.flatnonzero(support)
-        box = self._hull(cell_lower[passing], cell_upper[passing]) if len(passing) else None
+        if refine and len(passing):
+            regions = self._regions(self._refiner.refine(self._witnesses(pixels), self._entries.sets(passes)))
+        else:
+            regions = self._hulls(cell_lower[passing], cell_upper[passing], [np.arange(len(passing))] if len(passing) else [])
+        box = Box(np.min([part.lower for part in regions], axis=0), np.max([part.upper for part in regions], axis=0)) if regions else None
         state, used_fallback = self._shielded(box, network if proposal is None else self._checked_proposal(proposal))
         return Estimate(
             outcome=Outcome.NO_RUNWAY if box is None else Outcome.CERTIFIED,
@@ -166,13 +181,27 @@ class Estimator:
             passing=passing,
             mismatch=int(mismatch[cell]),
             filtered=filtered,
+            regions=regions,
             touches_boundary=box is not None and self._touches_boundary(box),
         )
 
-    def _hull(self, lower: NDArray[np.float32], upper: NDArray[np.float32]) -> Box:
-        """Hull of the passing cells' boxes within the domain, which holds the state by assumption."""
-        low, high = lower.min(axis=0).astype(np.float64), upper.max(axis=0).astype(np.float64)
-        return Box(np.maximum(low, self._domain_lower), np.minimum(high, self._domain_upper))
+    def _witnesses(self, pixels: NDArray[np.uint8]) -> NDArray[np.bool_]:
+        """The frame dilated by the tolerance: lit where a lit pixel lies within `line_px` in the sup norm."""
+        return dilated(pixels.view(np.bool_), self.scene.tolerance.line_px)
+
+    def _regions(self, pieces: StateSet) -> tuple[Box, ...]:
+        """Boxes of the connected parts of the pieces."""
+        return self._hulls(pieces.lower - STATE_MARGIN, pieces.upper + STATE_MARGIN, connected_parts(pieces))
+
+    def _hulls(self, lower: NDArray, upper: NDArray, parts: list[NDArray[np.int64]]) -> tuple[Box, ...]:
+        """The box of each part, within the domain, which holds the state by assumption."""
+        return tuple(
+            Box(
+                np.clip(lower[part].min(axis=0).astype(np.float64), self._domain_lower, self._domain_upper),
+                np.clip(upper[part].max(axis=0).astype(np.float64), self._domain_lower, self._domain_upper),
+            )
+            for part in parts
+        )
 
     @staticmethod
     def _shielded(box: Box | None, proposal: NDArray[np.float64]) -> tuple[NDArray[np.float64] | None, bool]:
@@ -228,6 +257,26 @@ class Estimator:
         except Exception as error:  # onnxruntime raises classes of its own that share only this one
             reason = " ".join(str(error).split())
             raise ModelError(f"{name}: onnxruntime {onnxruntime.__version__} cannot load it ({reason:.200})") from error
+
+
+@dataclass(frozen=True)
+class _Entries:
+    """Every bank entry of the model as a set of states, padding included, which never passes."""
+
+    all: StateSet
+
+    @staticmethod
+    def of(scene: Scene, tensors: dict[str, NDArray[Any]]) -> _Entries:
+        """The entries from the model's initialisers; an axis of width 0 is exact."""
+        states = np.stack([tensors["state_lower"], tensors["state_upper"]], axis=-1).astype(np.float64).reshape(4, -1, 2)
+        scale = np.stack([tensors["line_lower"][..., 2], tensors["line_upper"][..., 2]], axis=-1).reshape(-1, 2)
+        for axis, (low, high) in enumerate(zip(scene.domain.lower, scene.domain.upper, strict=True)):
+            states[axis] = np.clip(states[axis], low, high)
+        return _Entries(StateSet(*states, scale, tangent_of_row(scene.camera, tensors["reference_row"].ravel())))
+
+    def sets(self, passes: NDArray[np.bool_]) -> StateSet:
+        """The entries that pass; `passes` is (cells, entries)."""
+        return self.all[np.flatnonzero(passes)]
 
 
 def _packaged_model() -> Path:

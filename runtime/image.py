@@ -61,3 +61,13 @@ def lit_columns(scene: Scene, states: ArrayLike) -> tuple[Integers, Integers]:
 def runway_image(scene: Scene, states: ArrayLike) -> NDArray[np.uint8]:
     """I_r of every state, uint8 of {0, 1}. `states`: (..., 4); returns (..., height, width)."""
     return image_of_ends(project(scene, states), scene.camera.shape)
+
+
+def dilated(frame: NDArray[np.bool_], radius_px: int) -> NDArray[np.bool_]:
+    """The frame (height, width) with every pixel lit that has a lit one within `radius_px` in the sup norm."""
+    if radius_px == 0:
+        return frame
+    wide = np.pad(frame, radius_px)
+    span = 2 * radius_px + 1
+    rows = np.logical_or.reduce([wide[shift : shift + len(frame)] for shift in range(span)])
+    return np.logical_or.reduce([rows[:, shift : shift + frame.shape[1]] for shift in range(span)])

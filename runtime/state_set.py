@@ -4,11 +4,12 @@ A `StateSet` holds all states with theta, x, y and z in given intervals whose *s
 a reference row (`runtime.camera`), lies in an interval too. Pitch and altitude compensate each other in an image; the scale is
 what the image fixes, and a box in (theta, x, scale, z) bounds the lines of all markings at once.
 
-With phi = atan((v - v0)/F), the angle of row v below the camera's axis, and psi = theta + phi, that below the horizon:
+Rows enter as tangents t = (v - v0)/F = tan(phi), phi the angle below the camera's axis; psi = theta + phi is that below the horizon,
+and s(theta, t) = sin(psi)/cos(phi) = t cos(theta) + sin(theta). Then
 
-    g(v) = F sin(psi) / (y cos(phi))                  so y = F sin(psi_ref) / (scale cos(phi_ref))
-    g(v) = scale R,  R = sin(psi) cos(phi_ref) / (sin(psi_ref) cos(phi));   dR/dtheta has the sign of phi_ref - phi
-    a ground point d ahead, seen at row v:  y = d tan(psi),  g(v) = F cos(psi) / (d cos(phi)),  0 < psi < pi/2
+    g(v) = F s(theta, t) / y                          so y = F s(theta, t_ref) / scale
+    g(v) = scale R,  R = s(theta, t) / s(theta, t_ref);   dR/dtheta has the sign of t_ref - t
+    a ground point d ahead, seen at row v:  y = d tan(psi),  g(v) = F (cos(theta) - t sin(theta)) / d,  0 < psi < pi/2
 
 Every monotonicity that is used is one of these, or is checked over the set where it depends on it (`end_rows`). Results are
 plain float64 bounds; `runtime.rounding` turns them outward.
@@ -19,7 +20,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from runtime.camera import row_of_point
 from runtime.scene import Camera
@@ -29,7 +30,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class StateSet:
-    """A batch of sets of states; every field is (sets, 2), lower and upper, except `reference_row`, (sets,) px.
+    """A batch of sets of states; every field is (sets, 2), lower and upper, except `tangent`, (sets,): t_ref of the reference row.
 
     A set is empty where an interval is inverted; enclosures of an empty set are empty or arbitrary, never unsound.
     """
@@ -39,13 +40,13 @@ class StateSet:
     y: Floats
     z: Floats
     scale: Floats
-    reference_row: Floats
+    tangent: Floats
 
     def __len__(self) -> int:
         return len(self.theta)
 
     def __getitem__(self, index: NDArray) -> StateSet:
-        return StateSet(*(getattr(self, name)[index] for name in ("theta", "x", "y", "z", "scale", "reference_row")))
+        return StateSet(*(getattr(self, name)[index] for name in ("theta", "x", "y", "z", "scale", "tangent")))
 
     @property
     def lower(self) -> Floats:
@@ -58,77 +59,89 @@ class StateSet:
         return np.stack([self.theta[:, 1], self.x[:, 1], self.y[:, 1], self.z[:, 1]], axis=-1)
 
 
-def angle_below_axis(camera: Camera, v: Floats) -> Floats:
-    """phi = atan((v - v0)/F) of a row, rad."""
-    return np.arctan((v - camera.v0) / camera.focal_px)
+def tangent_of_row(camera: Camera, v: ArrayLike) -> Floats:
+    """t = (v - v0)/F of a row."""
+    return (np.asarray(v, dtype=np.float64) - camera.v0) / camera.focal_px
 
 
-def _sine_range(lower: Floats, upper: Floats) -> tuple[Floats, Floats]:
-    """Exact range of sin over [lower, upper] within [0, pi]."""
-    low, high = np.sin(lower), np.sin(upper)
-    return np.minimum(low, high), np.where((lower <= np.pi / 2) & (upper >= np.pi / 2), 1.0, np.maximum(low, high))
+def fall(theta: ArrayLike, tangent: ArrayLike) -> Floats:
+    """s(theta, t) = t cos(theta) + sin(theta): how far the ray of a row falls, per unit of depth; 0 at the horizon."""
+    return np.cos(theta) * tangent + np.sin(theta)
 
 
-def scale_range(camera: Camera, theta: Floats, y: Floats, row: Floats) -> tuple[Floats, Floats]:
-    """Exact range of g(row) over boxes theta (..., 2) x y (..., 2) in which row lies below the horizon."""
-    phi = angle_below_axis(camera, row)
-    low, high = _sine_range(theta[..., 0] + phi, theta[..., 1] + phi)
-    factor = camera.focal_px / np.cos(phi)
-    return factor * low / y[..., 1], factor * high / y[..., 0]
+def reach(theta: ArrayLike, tangent: ArrayLike) -> Floats:
+    """cos(theta) - t sin(theta): how far the ray of a row reaches ahead, per unit of depth; ds/dtheta."""
+    return np.cos(theta) - np.sin(theta) * tangent
+
+
+def fall_range(theta: Floats, tangent: Floats) -> tuple[Floats, Floats]:
+    """Exact range of s over theta in [theta[..., 0], theta[..., 1]], for psi within (-pi/2, pi): it rises up to psi = pi/2."""
+    low, high = fall(theta[..., 0], tangent), fall(theta[..., 1], tangent)
+    peaks = (reach(theta[..., 0], tangent) >= 0) & (reach(theta[..., 1], tangent) <= 0)
+    return np.minimum(low, high), np.where(peaks, np.sqrt(1 + tangent**2), np.maximum(low, high))
+
+
+def scale_range(camera: Camera, theta: Floats, y: Floats, tangent: Floats) -> tuple[Floats, Floats]:
+    """Exact range of g over boxes theta (..., 2) x y (..., 2), at rows below the horizon."""
+    low, high = fall_range(theta, tangent)
+    return camera.focal_px * low / y[..., 1], camera.focal_px * high / y[..., 0]
 
 
 def contract(camera: Camera, sets: StateSet) -> StateSet:
-    """The same sets with the intervals of theta, y and scale drawn in by y = F sin(psi_ref) / (scale cos(phi_ref))."""
-    phi = angle_below_axis(camera, sets.reference_row)
-    unit = camera.focal_px / np.cos(phi)
-    sine_low, sine_high = sets.scale[:, 0] * sets.y[:, 0] / unit, sets.scale[:, 1] * sets.y[:, 1] / unit
+    """The same sets with the intervals of theta and y drawn in by y = F s(theta, t_ref) / scale."""
+    tangent = sets.tangent
+    phi, secant = np.arctan(tangent), np.sqrt(1 + tangent**2)
+    sine_low, sine_high = (sets.scale[:, side] * sets.y[:, side] / (camera.focal_px * secant) for side in (0, 1))
     theta_low = np.maximum(sets.theta[:, 0], np.arcsin(np.clip(sine_low, 0, 1)) - phi)
-    rising = sets.theta[:, 1] + phi <= np.pi / 2  # below pi/2 the sine bounds the angle from above too
-    theta_high = np.where(rising, np.minimum(sets.theta[:, 1], np.arcsin(np.clip(sine_high, 0, 1)) - phi), sets.theta[:, 1])
-    theta = np.stack([theta_low, theta_high], axis=-1)
-    low, high = _sine_range(theta_low + phi, np.maximum(theta_high, theta_low) + phi)
-    y = np.stack([np.maximum(sets.y[:, 0], unit * low / sets.scale[:, 1]), np.minimum(sets.y[:, 1], unit * high / sets.scale[:, 0])], axis=-1)
+    rises = reach(sets.theta[:, 1], tangent) >= 0  # up to straight down the sine bounds the angle from above too
+    theta_high = np.where(rises, np.minimum(sets.theta[:, 1], np.arcsin(np.clip(sine_high, 0, 1)) - phi), sets.theta[:, 1])
+    theta = np.stack([theta_low, np.maximum(theta_high, theta_low - 1)], axis=-1)
+    y_low, y_high = altitude_range(camera, replace(sets, theta=theta))
+    y = np.stack([np.maximum(sets.y[:, 0], y_low), np.minimum(sets.y[:, 1], y_high)], axis=-1)
     return replace(sets, theta=theta, y=y)
+
+
+def altitude_range(camera: Camera, sets: StateSet) -> tuple[Floats, Floats]:
+    """Range of y = F s(theta, t_ref) / scale over theta and scale alone, (sets,) each."""
+    low, high = fall_range(sets.theta, sets.tangent)
+    return camera.focal_px * low / sets.scale[:, 1], camera.focal_px * high / sets.scale[:, 0]
 
 
 def end_rows(camera: Camera, sets: StateSet, end_z_m: float) -> tuple[Floats, Floats]:
     """Range of the row of a marking's end, (sets,) each, px: v0 + F tan(beta - theta), beta = atan2(y, end_z_m + z).
 
     Over the box (theta, y, z) the row falls in theta and z and rises in y. At one scale y follows theta, and
-    d(beta - theta)/dtheta = sin(beta) cos(beta) cot(psi_ref) - 1: where that is negative on the whole set, the row falls in theta
-    and in the scale, which bounds it far more closely. Both bounds hold; the closer one is returned.
+    d(beta - theta)/dtheta = sin(beta) cos(beta) cot(psi_ref) - 1: where that is negative for all altitudes that theta and scale
+    allow, the row falls in theta and in the scale, which bounds it far more closely. Both bounds hold; the closer one is returned.
     """
     near, far = end_z_m + sets.z[:, 0], end_z_m + sets.z[:, 1]
     low = row_of_point(camera, sets.theta[:, 1], sets.y[:, 0], far)
     high = row_of_point(camera, sets.theta[:, 0], sets.y[:, 1], near)
-    phi = angle_below_axis(camera, sets.reference_row)
-    cotangent = 1 / np.tan(sets.theta[:, 0] + phi)
-    double_low, double_high = 2 * np.arctan2(sets.y[:, 0], far), 2 * np.arctan2(sets.y[:, 1], near)
-    falls = 0.5 * _sine_range(double_low, double_high)[1] * np.maximum(cotangent, 0) < 1
-    unit = camera.focal_px / np.cos(phi)
-    y_low = unit * np.sin(sets.theta[:, 1] + phi) / sets.scale[:, 1]
-    y_high = unit * np.sin(sets.theta[:, 0] + phi) / sets.scale[:, 0]
-    low_on_scale, high_on_scale = row_of_point(camera, sets.theta[:, 1], y_low, far), row_of_point(camera, sets.theta[:, 0], y_high, near)
+    y_low, y_high = altitude_range(camera, sets)
+    slope = np.minimum(np.maximum(sets.y[:, 1], y_high) / near, 1.0)  # sin(beta) cos(beta) = slope / (1 + slope^2) rises up to slope 1
+    cotangent = reach(sets.theta[:, 0], sets.tangent) / fall(sets.theta[:, 0], sets.tangent)
+    falls = slope / (1 + slope**2) * np.maximum(cotangent, 0) < 1
+    y_steep, y_flat = (camera.focal_px * fall(sets.theta[:, side], sets.tangent) / sets.scale[:, side] for side in (1, 0))
+    low_on_scale = row_of_point(camera, sets.theta[:, 1], y_steep, far)
+    high_on_scale = row_of_point(camera, sets.theta[:, 0], y_flat, near)
     return np.where(falls, np.maximum(low, low_on_scale), low), np.where(falls, np.minimum(high, high_on_scale), high)
 
 
-def scale_on_scale(camera: Camera, sets: StateSet, row: Floats) -> tuple[Floats, Floats]:
-    """Range of g(row) over each set from its scale alone; `row` (sets, rows). Below the horizon g > 0, so the bounds stop at 0."""
-    phi, phi_ref = angle_below_axis(camera, row), angle_below_axis(camera, sets.reference_row)[:, None]
-    ratios = [np.sin(theta[:, None] + phi) * np.cos(phi_ref) / (np.sin(theta[:, None] + phi_ref) * np.cos(phi)) for theta in sets.theta.T]
-    low, high = np.minimum(*ratios), np.maximum(*ratios)
-    return sets.scale[:, :1] * np.maximum(low, 0), sets.scale[:, 1:] * np.maximum(high, 0)
+def scale_ratio(sets: StateSet, tangent: Floats) -> tuple[Floats, Floats]:
+    """Range of R = s(theta, t) / s(theta, t_ref) over each set; `tangent` (sets, rows). Below the horizon R > 0: bounds stop at 0."""
+    first, second = (fall(theta[:, None], tangent) / fall(theta, sets.tangent)[:, None] for theta in sets.theta.T)
+    return np.maximum(np.minimum(first, second), 0), np.maximum(np.maximum(first, second), 0)
 
 
-def scale_between(camera: Camera, sets: StateSet, y: Floats, start: Floats, stop: Floats) -> tuple[Floats, Floats]:
-    """Range of g over rows [start, stop], (sets, rows) each, and altitudes y (sets, rows, 2); g rises with the row."""
-    theta = sets.theta[:, None, :]
-    low_on_scale, high_on_scale = scale_on_scale(camera, sets, start)[0], scale_on_scale(camera, sets, stop)[1]
+def scale_between(camera: Camera, sets: StateSet, start: Floats, stop: Floats) -> tuple[Floats, Floats]:
+    """Range of g over rows with tangents [start, stop], (sets, rows) each; g rises with the row."""
+    theta, y = sets.theta[:, None, :], sets.y[:, None, :]
+    low_on_scale, high_on_scale = sets.scale[:, :1] * scale_ratio(sets, start)[0], sets.scale[:, 1:] * scale_ratio(sets, stop)[1]
     low, high = scale_range(camera, theta, y, start)[0], scale_range(camera, theta, y, stop)[1]
     return np.maximum(low_on_scale, low), np.minimum(high_on_scale, np.maximum(high, 0))
 
 
 def column_range(camera: Camera, across: Floats, scale: tuple[Floats, Floats]) -> tuple[Floats, Floats]:
-    """Range of u0 + (p_x - x) g for p_x - x in `across` (sets, 2) and g >= 0 between the two `scale` (sets, rows)."""
-    low, high = across[:, :1], across[:, 1:]
+    """Range of u0 + (p_x - x) g for p_x - x in `across` (..., 2) and g >= 0 between the two `scale` (..., rows)."""
+    low, high = across[..., :1], across[..., 1:]
     return camera.u0 + np.minimum(low * scale[0], low * scale[1]), camera.u0 + np.maximum(high * scale[0], high * scale[1])

@@ -19,7 +19,7 @@ from runtime.scene import Scene
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch is imported: pytest runs one worker a core
 
 settings.register_profile("quick", deadline=None, derandomize=True, suppress_health_check=[HealthCheck.too_slow])
-settings.register_profile("long", deadline=None, max_examples=5000, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("long", deadline=None, max_examples=2000, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("quick")
 
 

@@ -52,7 +52,7 @@ def opencv_ends(scene: Scene, state: Floats) -> Floats:
     intrinsic = np.array([[camera.focal_px, 0, camera.u0], [0, camera.focal_px, camera.v0], [0, 0, 1]])
     points = np.array([[marking.x_m, 0.0, end] for marking in scene.runway.markings for end in marking.ends_z_m])
     pixels, _ = cv2.projectPoints(points, np.array([theta, 0.0, 0.0]), translation, intrinsic, np.zeros(4))
-    return pixels.reshape(-1, 2, 2)
+    return np.asarray(pixels, dtype=np.float64).reshape(-1, 2, 2)
 
 
 @pytest.mark.parametrize("name", ["paper", "general"])
@@ -275,7 +275,7 @@ def test_the_column_of_an_end_turns_in_pitch_in_11_of_27_cells(paper_scene: Scen
         grid = list(itertools.product(np.linspace(lower[2], upper[2], 9), np.linspace(lower[3], upper[3], 9)))
         slopes = np.diff([columns_over_pitch(paper_scene, thetas, y, z) for y, z in grid], axis=1)
         turns = ((slopes < 0).any(axis=1) & (slopes > 0).any(axis=1)).any(axis=0)
-        for end, turn in zip((0.0, 0.3), turns, strict=True):
+        for end, turn in zip((0.0, 0.3), turns.tolist(), strict=True):
             flattest, steepest = math.atan2(lower[2], end + upper[3]), math.atan2(upper[2], end + lower[3])
             assert turn == (max(flattest, lower[0]) < min(steepest, upper[0]))
         turning += turns.any()

@@ -76,11 +76,11 @@ def exact_ends(scene: Scene, tangent: Fraction, x: Fraction, y: Fraction, z: Fra
 
 def nearby_pixels(camera: Camera, start: Point, stop: Point) -> list[tuple[int, int]]:
     """(column, row) of all pixels of the frame in the segment's bounding box and two pixels around it."""
-    spans = [
+    columns, rows = (
         range(max(math.floor(min(start[axis], stop[axis])) - 2, 0), min(math.floor(max(start[axis], stop[axis])) + 3, size))
         for axis, size in enumerate((camera.width, camera.height))
-    ]
-    return list(itertools.product(*spans))
+    )
+    return list(itertools.product(columns, rows))
 
 
 def twin_image(scene: Scene, segments: list[tuple[Point, Point]]) -> NDArray[np.uint8]:

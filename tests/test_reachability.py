@@ -33,10 +33,10 @@ from build_model.reachability import (
     snap_outward,
     zeta_bounds,
 )
-from runtime.rounding import OUTWARD_PX
 from build_model.runway_network import RunwayNetwork, pixel_weights
 from runtime.camera import project
 from runtime.image import runway_image
+from runtime.rounding import OUTWARD_PX
 from runtime.scene import Axis, Bank, Camera, Domain, Marking, Runway, Scene, Tolerance
 
 PAPER = Scene.load(Path(__file__).parent.parent / "models" / "paper.toml")
@@ -219,10 +219,13 @@ AROUND = Window(215, 268, 288, 312)
 
 
 @pytest.mark.parametrize("half_px", [0.0, 0.3, 3.0, 30.0])
-def test_every_layer_contains_samples(half_px: float) -> None:
+@pytest.mark.parametrize(("left", "top"), [(296, 232), (0, 0), (6, 0)])
+def test_every_layer_contains_samples(half_px: float, left: int, top: int) -> None:
+    """At the middle of a marking, there and where the frame begins, and near a far end with u2 = 0 within the box."""
     rng = np.random.default_rng(5)
-    window = Window(232, 240, 296, 304)
-    low, high = snap_outward(ZETA - half_px, ZETA + half_px, window)
+    window = Window(top, top + 8, left, left + 8)
+    zeta = ZETA + np.tile([left - 296, top - 232], 2) - (0 if left != 6 else [13, -11, 13, -21])
+    low, high = snap_outward(zeta - half_px, zeta + half_px, window)
     weights = pixel_weights(window).reshape(-1, 16, 6)
     network = layers(weights)
     bounds = mixed_monotone_layers(network, *(np.broadcast_to(bound, (len(weights), 4)) for bound in (low, high)))
@@ -240,6 +243,22 @@ def test_bounds_over_one_point_are_the_network(method: Method) -> None:
     value = RunwayNetwork(PAPER.camera, AROUND)(torch.from_numpy(zeta)[None])[0].numpy()
     assert 40 < (value > 0).sum() < 60
     np.testing.assert_array_equal(network_upper_bounds(AROUND, zeta, zeta, method), value)
+
+
+@pytest.mark.parametrize("method", Method)
+@pytest.mark.parametrize("half", [[0.5, 2.0, 0.5, 2.0], [4.0, 1.0, 2.0, 25.0]])
+def test_upper_bounds_contain_the_network(method: Method, half: list[float]) -> None:
+    """Markings leaning to the left and to the right, steep and flat, and with their ends swapped."""
+    rng = np.random.default_rng(10)
+    window = Window(0, 24, 0, 24)
+    network = RunwayNetwork(PAPER.camera, window)
+    for ends in ([6, 21, 13, 3], [13, 21, 6, 3], [3, 12, 21, 8], [3, 8, 21, 12]):
+        for zeta in (np.array(ends), np.array([*ends[2:], *ends[:2]])):
+            low, high = zeta + 0.37 - half, zeta + 0.37 + half
+            bound = network_upper_bounds(window, low, high, method)
+            value = network(torch.from_numpy(rng.uniform(low, high, (50, 4)))).numpy()
+            assert (value <= bound * (1 + 1e-12)).all()
+            assert (value > 0).any()
 
 
 def test_orientation_is_exact_at_its_16_corners() -> None:
