@@ -58,8 +58,8 @@ def export_model(
 
 
 def _progress(console: Console) -> Progress:
-    columns = (TextColumn("{task.description:<22}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.fields[loss]}"))
-    return Progress(*columns, console=console)
+    texts = TextColumn("{task.description:<22}"), TextColumn("{task.fields[loss]}")
+    return Progress(texts[0], BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), texts[1], console=console)
 
 
 class _Bars:
@@ -96,7 +96,7 @@ def _print_summary(console: Console, scene: Scene, target: Path, report: ExportR
         console.print(report.training.table())
     console.print("The certificate assumes:")
     for line in assumptions(scene):
-        console.print(f"  - {line}", highlight=False)
+        console.print(f"  - {line}", highlight=False, markup=False)
 
 
 def export_model_command() -> None:

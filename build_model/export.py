@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 import platform
 import time
+import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
@@ -130,7 +132,7 @@ def filter_function(filter_part: onnx.GraphProto) -> Callable[[NDArray[np.uint8]
     options.intra_op_num_threads = 1
     options.log_severity_level = 3  # it warns of the budgets, initialisers that are inputs too
     session = onnxruntime.InferenceSession(_serialised(filter_part, {}), options, providers=["CPUExecutionProvider"])
-    return lambda frames: np.stack([session.run(["filtered"], {"frame": frame})[0] for frame in frames])
+    return lambda frames: np.stack([np.asarray(session.run(["filtered"], {"frame": frame})[0]) for frame in frames])
 
 
 def _state_network(
@@ -140,11 +142,24 @@ def _state_network(
     if estimator is not None:
         return user_network(scene, Path(estimator)), None
     network, report = train_state_network(scene, filter_function(filter_part), seed, progress)
-    example = torch.zeros((1, 1, *scene.camera.shape), dtype=torch.uint8)
-    program = torch.onnx.export(network, (example,), dynamo=True, opset_version=OPSET, optimize=True, verbose=False)
+    return exported(network.eval(), scene.camera.shape), report
+
+
+def exported(network: torch.nn.Module, shape: tuple[int, int]) -> onnx.GraphProto:
+    """A torch network of uint8 images [1, 1, height, width] as a graph."""
+    example = torch.zeros((1, 1, *shape), dtype=torch.uint8)
+    log = logging.getLogger("torch.onnx")
+    level = log.level
+    log.setLevel(logging.ERROR)  # it tells of torchvision's operators, which are not used
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", category=FutureWarning, module="copyreg")  # torch's own use of its pytree
+            program = torch.onnx.export(network, (example,), dynamo=True, opset_version=OPSET, optimize=True, verbose=False)
+    finally:
+        log.setLevel(level)
     if program is None:
         raise RuntimeError("torch.onnx.export gave no program")
-    return program.model_proto.graph, report
+    return program.model_proto.graph
 
 
 def user_network(scene: Scene, path: Path) -> onnx.GraphProto:

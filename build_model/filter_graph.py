@@ -8,6 +8,8 @@ by the transpose of that map: +1 and -1 at the ends of the runs, summed down the
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import onnx
 from numpy.typing import NDArray
@@ -37,7 +39,7 @@ class GraphWriter:
         self.constants.append(numpy_helper.from_array(np.ascontiguousarray(values).reshape(np.shape(values)), name))
         return name
 
-    def node(self, operator: str, output: str, *inputs: str, **attributes: object) -> str:
+    def node(self, operator: str, output: str, *inputs: str, **attributes: Any) -> str:
         """Adds a node and returns the name of its output."""
         self.nodes.append(helper.make_node(operator, inputs, [output], name=output, **attributes))
         return output
@@ -87,9 +89,7 @@ def _column_sums(g: GraphWriter, scene: Scene, tables: FilterTables) -> tuple[st
         return crop, sums, sums
     g.whole("image_axes", 0, 1)
     image = g.node("Unsqueeze", "crop_image", crop, "image_axes")
-    dilated = g.node(
-        "MaxPool", "dilated_image", image, kernel_shape=[2 * tolerance + 1] * 2, pads=[tolerance] * 4, strides=[1, 1]
-    )
+    dilated = g.node("MaxPool", "dilated_image", image, kernel_shape=[2 * tolerance + 1] * 2, pads=[tolerance] * 4, strides=[1, 1])
     return crop, sums, _sums(g, "dilated", g.node("Squeeze", "dilated", dilated, "image_axes"))
 
 

@@ -38,9 +38,7 @@ class Window:
 
     def union(self, other: Window) -> Window:
         """The smallest window that holds both."""
-        return Window(
-            min(self.top, other.top), max(self.bottom, other.bottom), min(self.left, other.left), max(self.right, other.right)
-        )
+        return Window(min(self.top, other.top), max(self.bottom, other.bottom), min(self.left, other.left), max(self.right, other.right))
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ def spatial_filter(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.f
     columns = columns_that_may_be_lit(scene, slice_cell(scene, lower, upper))
     widened = clip_and_widen(scene, columns, scene.tolerance.line_px)
     window = window_of(widened)
-    return paint(widened, window).any(axis=0), window
+    return np.logical_or.reduce(paint(widened, window), axis=0), window
 
 
 def spatial_filters(scene: Scene) -> Bits:

@@ -44,7 +44,7 @@ POSITIONS = 8
 """The window is convolved until at most this many positions along its rows are left for the dense layers."""
 HIDDEN = 64
 
-LEARNING_RATE = 4e-3
+LEARNING_RATE = 6e-3
 WARM_UP = 0.15
 """Share of the steps in which the learning rate rises, before it falls to 0 along a cosine."""
 THREADS = 2
@@ -53,7 +53,7 @@ LARGEST_MISSED = 8
 """Half of the training frames miss 1 to this many pixels of the runway, the others none."""
 CLEAN_SHARE = 0.1
 """Share of the training frames without any clutter: a network that never saw one is twice as far off on clean frames."""
-VALIDATION_FRAMES = 2000
+VALIDATION_FRAMES = 1000
 VALIDATION_CLUTTER = (0.0, 0.02, 0.05)
 FRAMES_AT_ONCE = 64
 

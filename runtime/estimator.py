@@ -118,7 +118,7 @@ class Estimator:
         self.metadata: dict[str, Any] = model.metadata
         self.sha256 = model.sha256
         try:
-            self.scene = Scene.from_dict(model.metadata.get("scene"))
+            self.scene = Scene.from_dict(model.metadata.get("scene", {}))
         except SceneError as error:
             raise ModelError(f"{name}: the scene in its metadata is unusable ({error})") from error
         self._budgets = self._checked_budgets(name, missed_budget, extra_budget)
@@ -161,7 +161,7 @@ class Estimator:
         `FrameError` for any other frame and ValueError for a proposal of another shape.
         """
         pixels = self._checked_frame(frame)
-        results = self._session.run(OUTPUTS, {"frame": pixels, **self._budgets})
+        results: list[Any] = list(self._session.run(OUTPUTS, {"frame": pixels, **self._budgets}))
         cell, support, mismatch, passes, cell_lower, cell_upper, filtered, network_state = results
         network = np.where(self._fixed, self._domain_lower, network_state)
         passing = np.flatnonzero(support)
@@ -272,7 +272,8 @@ class _Entries:
         scale = np.stack([tensors["line_lower"][..., 2], tensors["line_upper"][..., 2]], axis=-1).reshape(-1, 2)
         for axis, (low, high) in enumerate(zip(scene.domain.lower, scene.domain.upper, strict=True)):
             states[axis] = np.clip(states[axis], low, high)
-        return _Entries(StateSet(*states, scale, tangent_of_row(scene.camera, tensors["reference_row"].ravel())))
+        theta, x, y, z = states
+        return _Entries(StateSet(theta, x, y, z, scale, tangent_of_row(scene.camera, tensors["reference_row"].ravel())))
 
     def sets(self, passes: NDArray[np.bool_]) -> StateSet:
         """The entries that pass; `passes` is (cells, entries)."""

@@ -191,8 +191,8 @@ class _LitColumns:
 def _lit_columns(scene: Scene, canvas: Bits, sets: StateSet, grid: _Grid) -> _LitColumns:
     """Looks the usable columns up in the frame; `canvas` is the frame within a border of lit pixels."""
     across = scene.runway.x_m[:, None] - sets.x[:, None, ::-1]
-    scale = tuple(bound[:, None, :] for bound in (sets.scale[:, :1] * grid.ratio[0], sets.scale[:, 1:] * grid.ratio[1]))
-    low, high = column_range(scene.camera, across, scale)
+    slow, fast = sets.scale[:, :1] * grid.ratio[0], sets.scale[:, 1:] * grid.ratio[1]
+    low, high = column_range(scene.camera, across, (slow[:, None, :], fast[:, None, :]))
     first = np.floor(below(np.minimum(low[..., :-1], low[..., 1:]))).astype(np.int64)
     last = np.floor(above(np.maximum(high[..., :-1], high[..., 1:]))).astype(np.int64)
     height, width = scene.camera.shape
@@ -256,14 +256,12 @@ def connected_parts(sets: StateSet) -> list[NDArray[np.int64]]:
     """Numbers of the sets in each connected part of their union: parts are joined where boxes (theta, x, y, z) touch."""
     lower, upper = sets.lower - STATE_MARGIN, sets.upper + STATE_MARGIN
     touch = ((lower[:, None] <= upper[None]) & (lower[None] <= upper[:, None])).all(axis=-1)
-    left, parts = np.ones(len(sets), dtype=bool), []
+    left: Bits = np.ones(len(sets), dtype=bool)
+    parts: list[NDArray[np.int64]] = []
     while left.any():
-        part = np.zeros(len(sets), dtype=bool)
-        part[np.argmax(left)] = True
-        grown = touch[part].any(axis=0)
-        while (grown & ~part).any():
-            part |= grown
-            grown = touch[part].any(axis=0)
-        parts.append(np.flatnonzero(part))
-        left &= ~part
+        part, reached = 0, np.array([np.argmax(left)])
+        while len(reached) > part:
+            part, reached = len(reached), np.flatnonzero(touch[reached].any(axis=0))
+        parts.append(reached)
+        left[reached] = False
     return parts

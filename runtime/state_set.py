@@ -64,12 +64,12 @@ def tangent_of_row(camera: Camera, v: ArrayLike) -> Floats:
     return (np.asarray(v, dtype=np.float64) - camera.v0) / camera.focal_px
 
 
-def fall(theta: ArrayLike, tangent: ArrayLike) -> Floats:
+def fall(theta: Floats, tangent: Floats) -> Floats:
     """s(theta, t) = t cos(theta) + sin(theta): how far the ray of a row falls, per unit of depth; 0 at the horizon."""
     return np.cos(theta) * tangent + np.sin(theta)
 
 
-def reach(theta: ArrayLike, tangent: ArrayLike) -> Floats:
+def reach(theta: Floats, tangent: Floats) -> Floats:
     """cos(theta) - t sin(theta): how far the ray of a row reaches ahead, per unit of depth; ds/dtheta."""
     return np.cos(theta) - np.sin(theta) * tangent
 
@@ -117,8 +117,8 @@ def end_rows(camera: Camera, sets: StateSet, end_z_m: float) -> tuple[Floats, Fl
     near, far = end_z_m + sets.z[:, 0], end_z_m + sets.z[:, 1]
     low = row_of_point(camera, sets.theta[:, 1], sets.y[:, 0], far)
     high = row_of_point(camera, sets.theta[:, 0], sets.y[:, 1], near)
-    y_low, y_high = altitude_range(camera, sets)
-    slope = np.minimum(np.maximum(sets.y[:, 1], y_high) / near, 1.0)  # sin(beta) cos(beta) = slope / (1 + slope^2) rises up to slope 1
+    slope = np.minimum(np.maximum(sets.y[:, 1], altitude_range(camera, sets)[1]) / near, 1.0)
+    # sin(beta) cos(beta) = slope / (1 + slope^2), which rises up to slope 1
     cotangent = reach(sets.theta[:, 0], sets.tangent) / fall(sets.theta[:, 0], sets.tangent)
     falls = slope / (1 + slope**2) * np.maximum(cotangent, 0) < 1
     y_steep, y_flat = (camera.focal_px * fall(sets.theta[:, side], sets.tangent) / sets.scale[:, side] for side in (1, 0))

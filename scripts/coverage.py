@@ -12,10 +12,10 @@ import functools
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, cast
 
 import joblib
 import numpy as np
@@ -180,9 +180,9 @@ def run_frame(rng: Rng, estimator: Estimator, scenario: Scenario) -> Tally:
 
 def cell_of(scene: Scene, state: NDArray[np.float64]) -> int:
     """Number of the cell that holds a state of the domain."""
-    shape = [len(axis.centres) for axis in scene.domain.axes]
-    index = [min(int(np.searchsorted(axis.edges[1:-1], value)), size - 1) for axis, value, size in zip(scene.domain.axes, state, shape, strict=True)]
-    return int(np.ravel_multi_index(index, shape))
+    axes = scene.domain.axes
+    index = [int(np.searchsorted(axis.edges[1:-1], value)) for axis, value in zip(axes, state, strict=True)]
+    return int(np.ravel_multi_index(index, [len(axis.centres) for axis in axes]))
 
 
 def tolerant_model(scene: Scene, folder: Path) -> Path:
@@ -224,7 +224,7 @@ def main(
     """Run every scenario and print the table."""
     output.parent.mkdir(parents=True, exist_ok=True)
     tolerant = tolerant_model(Estimator.load(model).scene, output.parent)
-    work: list[tuple[str, Callable[[], Tally]]] = []
+    work: list[tuple[str, Any]] = []
     for number, scenario in enumerate(scenarios(None if recording is None else str(recording))):
         path = str(tolerant if scenario.tolerant else model)
         for chunk in range(math.ceil(states / CHUNK)):
@@ -232,8 +232,8 @@ def main(
             work.append((scenario.name, joblib.delayed(run_chunk)(path, scenario, [seed, number, chunk], frames)))
     results: dict[str, Tally] = {}
     tallies = joblib.Parallel(n_jobs=jobs, return_as="generator")(job for _, job in work)
-    for (name, _), tally in zip(work, track(tallies, total=len(work), description="frames"), strict=True):
-        results[name] = results.get(name, Tally()) + tally
+    for (name, _), tally in zip(work, track(iter(tallies), total=len(work), description="frames"), strict=True):
+        results[name] = results.get(name, Tally()) + cast(Tally, tally)
     Console(width=200).print(table(results))
     output.write_text(json.dumps({name: summary(tally) for name, tally in results.items()}, indent=2))
     if any(tally.violations or tally.pixels_lost for tally in results.values()):
