@@ -2,19 +2,23 @@
 
 It is not certified; the runtime keeps an estimate only inside the certified box. Training frames are exact images of random
 states of the domain with pixels missed and clutter added, and pass the same NN_F that stands before the network in the model.
-Everything random comes from one seed, and threads are fixed in number: the same seed gives the same weights to the last bit.
+Everything random comes from one seed, and every sum has a fixed order: the same seed gives the same weights to the last bit.
 """
 
 from __future__ import annotations
 
+import logging
 import math
+import warnings
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import reduce
 from typing import TYPE_CHECKING
 
 import numpy as np
+import onnx
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
@@ -47,8 +51,9 @@ HIDDEN = 64
 LEARNING_RATE = 6e-3
 WARM_UP = 0.15
 """Share of the steps in which the learning rate rises, before it falls to 0 along a cosine."""
-THREADS = 2
-"""The order of the sums, and with it the last bits of the weights, depends on the number of threads."""
+SHARDS = 2
+"""Parts of a batch whose gradients are taken in parallel, each by one thread of torch. Sums are then in an order of their own, which
+neither the machine's load nor its number of cores changes; and threads that wait for each other only once a step bear a busy machine."""
 LARGEST_MISSED = 8
 """Half of the training frames miss 1 to this many pixels of the runway, the others none."""
 CLEAN_SHARE = 0.1
@@ -124,6 +129,7 @@ class StateNetwork(nn.Module):
 
     def __init__(self, scene: Scene) -> None:
         super().__init__()
+        self.frame_shape = scene.camera.shape
         self.window = domain_window(scene)
         rows, columns = self.window.shape
         blocks = max(2, -(-rows // BLOCK_ROWS))
@@ -144,7 +150,7 @@ class StateNetwork(nn.Module):
     def forward(self, filtered: Tensor) -> Tensor:
         """`filtered`: (n, 1, height, width) of {0, 1}, uint8 or float. Returns (n, 4) float32: theta (rad), x, y, z (m)."""
         rows, columns = self.window.slices
-        image = filtered[:, 0, rows, columns].to(torch.float32)
+        image = filtered[:, :, rows, columns].squeeze(1).to(torch.float32)
         return self.middle + self.half_width * self.normalised(image)
 
     def normalised(self, image: Tensor) -> Tensor:
@@ -153,6 +159,27 @@ class StateNetwork(nn.Module):
         for convolution in self.convolutions:
             signal = functional.relu(convolution(signal))
         return self.last(functional.relu(self.hidden(signal.flatten(1))))
+
+
+def state_graph(network: StateNetwork, opset: int) -> onnx.ModelProto:
+    """NN_e as a static ONNX model of standard operators: uint8 [1, 1, height, width] to float32 [1, 4].
+
+    torch's exporter warns of its own use of a deprecated call, and logs that torchvision is missing, which nothing here needs: both
+    are kept from the user.
+    """
+    example = torch.zeros((1, 1, *network.frame_shape), dtype=torch.uint8)
+    log = logging.getLogger("torch.onnx._internal.exporter._registration")
+    level = log.level
+    try:
+        log.setLevel(logging.ERROR)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=r".*LeafSpec.* is deprecated", category=FutureWarning)
+            program = torch.onnx.export(network, (example,), dynamo=True, opset_version=opset, optimize=True, verbose=False)
+    finally:
+        log.setLevel(level)
+    if program is None:
+        raise RuntimeError("torch.onnx.export gave no program")
+    return program.model_proto
 
 
 def domain_window(scene: Scene) -> Window:
@@ -243,16 +270,16 @@ def train_state_network(
             validation_error(network, source.draw(unseen_count, of_validation, clutter), clutter) for clutter in VALIDATION_CLUTTER
         ]
     weights = sum(parameter.numel() for parameter in network.parameters())
-    return network, TrainingReport(total, weights, tuple(training_loss), tuple(validation_loss), tuple(validation))
+    return network.eval(), TrainingReport(total, weights, tuple(training_loss), tuple(validation_loss), tuple(validation))
 
 
 @contextmanager
 def _reproducible(seed: int) -> Iterator[None]:
-    """Torch with this seed, deterministic algorithms and THREADS threads; what was set before comes back afterwards."""
+    """Torch with this seed, deterministic algorithms and one thread; what was set before comes back afterwards."""
     threads, deterministic = torch.get_num_threads(), torch.are_deterministic_algorithms_enabled()
     with torch.random.fork_rng(devices=[]):
         try:
-            torch.set_num_threads(THREADS)
+            torch.set_num_threads(1)
             torch.use_deterministic_algorithms(True)
             torch.manual_seed(seed)
             yield
@@ -269,19 +296,32 @@ def _fit(
     optimiser = torch.optim.Adam(network.parameters(), lr=LEARNING_RATE)
     schedule = torch.optim.lr_scheduler.LambdaLR(optimiser, lambda step: learning_rate_share(step, epochs * batches))
     training_loss, validation_loss = [], []
-    for epoch in range(epochs):
-        losses = []
-        for batch, chosen in enumerate(np.array_split(rng.permutation(len(frames)), batches)):
-            optimiser.zero_grad()
-            loss = _loss(network, network.normalised(frames.images(chosen)), frames.states[chosen])
-            loss.backward()
-            optimiser.step()
-            schedule.step()
-            losses.append(loss.item())
-            progress("training NN_e", epoch * batches + batch + 1, epochs * batches, losses[-1])
-        training_loss.append(float(np.mean(losses)))
-        validation_loss.append(_loss(network, _scaled(network, unseen), unseen.states).item())
+    # A new thread does not take over the setting of the thread that starts it.
+    with ThreadPoolExecutor(SHARDS, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        for epoch in range(epochs):
+            losses = []
+            for batch, chosen in enumerate(np.array_split(rng.permutation(len(frames)), batches)):
+                losses.append(_set_gradients(network, frames, chosen, pool))
+                optimiser.step()
+                schedule.step()
+                progress("training NN_e", epoch * batches + batch + 1, epochs * batches, losses[-1])
+            training_loss.append(float(np.mean(losses)))
+            validation_loss.append(float(_loss(network, _scaled(network, unseen), unseen.states).mean()))
     return training_loss, validation_loss
+
+
+def _set_gradients(network: StateNetwork, frames: FilteredFrames, chosen: NDArray[np.int64], pool: ThreadPoolExecutor) -> float:
+    """Gradients of the mean loss over the chosen frames, taken in SHARDS parts and summed in their order. Returns the loss."""
+    parameters = list(network.parameters())
+
+    def gradients(part: NDArray[np.int64]) -> tuple[float, tuple[Tensor, ...]]:
+        loss = _loss(network, network.normalised(frames.images(part)), frames.states[part]).sum() / len(chosen)
+        return loss.item(), torch.autograd.grad(loss, parameters)
+
+    losses, parts = zip(*pool.map(gradients, np.array_split(chosen, min(SHARDS, len(chosen)))), strict=True)
+    for parameter, *shares in zip(parameters, *parts, strict=True):
+        parameter.grad = sum(shares[1:], start=shares[0])
+    return sum(losses)
 
 
 def learning_rate_share(step: int, steps: int) -> float:
@@ -291,11 +331,11 @@ def learning_rate_share(step: int, steps: int) -> float:
 
 
 def _loss(network: StateNetwork, scaled: Tensor, states: NDArray[np.float64]) -> Tensor:
-    """Mean 2-norm, over the free axes, of the error of `scaled` (n, 4), in half-widths of the domain, against true states (n, 4)."""
+    """2-norm, over the free axes, of the error of `scaled` (n, 4) in half-widths of the domain; true states (n, 4). Returns (n,)."""
     free = network.half_width > 0
     truth = (torch.from_numpy(states).to(torch.float32) - network.middle)[:, free] / network.half_width[free]
     squares = (scaled[:, free] - truth).square().sum(dim=1)
-    return torch.sqrt(squares + 1e-6).mean()  # 1e-6 keeps the gradient finite where the error is 0
+    return torch.sqrt(squares + 1e-6)  # 1e-6 keeps the gradient finite where the error is 0
 
 
 @torch.no_grad()

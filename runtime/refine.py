@@ -255,13 +255,13 @@ def _carries_a_face(sets: StateSet, pieces: int) -> Bits:
 def connected_parts(sets: StateSet) -> list[NDArray[np.int64]]:
     """Numbers of the sets in each connected part of their union: parts are joined where boxes (theta, x, y, z) touch."""
     lower, upper = sets.lower - STATE_MARGIN, sets.upper + STATE_MARGIN
-    touch = ((lower[:, None] <= upper[None]) & (lower[None] <= upper[:, None])).all(axis=-1)
+    touch = np.logical_and.reduce((lower[:, None] <= upper[None]) & (lower[None] <= upper[:, None]), axis=-1)
     left: Bits = np.ones(len(sets), dtype=bool)
     parts: list[NDArray[np.int64]] = []
     while left.any():
-        part, reached = 0, np.array([np.argmax(left)])
-        while len(reached) > part:
-            part, reached = len(reached), np.flatnonzero(touch[reached].any(axis=0))
+        size, reached = 0, np.array([np.argmax(left)])
+        while len(reached) > size:
+            size, reached = len(reached), np.flatnonzero(touch[reached].any(axis=0))
         parts.append(reached)
         left[reached] = False
     return parts
