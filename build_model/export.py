@@ -9,12 +9,11 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import os
 import platform
 import time
-import warnings
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib import metadata as distributions
@@ -27,7 +26,6 @@ import onnx
 import onnx.compose
 import onnx.version_converter
 import onnxruntime
-import torch
 from numpy.typing import NDArray
 from onnx import TensorProto, helper
 
@@ -37,7 +35,7 @@ from build_model.filter_network import FilterTables, assemble
 from build_model.hough_bank import CellBank, cell_bank
 from build_model.partition import partition
 from build_model.reachability import paper_bound
-from build_model.state_network import TrainingReport, train_state_network
+from build_model.state_network import TrainingReport, state_graph, train_state_network
 from runtime.model_file import FORMAT_VERSION, METADATA_KEY
 from runtime.rounding import OUTWARD_PX
 from runtime.scene import Scene
@@ -127,12 +125,17 @@ def build_banks(scene: Scene, jobs: int = 1, progress: Progress = _silent) -> li
 
 
 def filter_function(filter_part: onnx.GraphProto) -> Callable[[NDArray[np.uint8]], NDArray[np.uint8]]:
-    """NN_F alone as a function from frames (n, height, width) to filtered frames of the same shape."""
+    """NN_F alone as a function from frames (n, height, width) to filtered frames of the same shape and order, on two threads."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.log_severity_level = 3  # it warns of the budgets, initialisers that are inputs too
     session = onnxruntime.InferenceSession(_serialised(filter_part, {}), options, providers=["CPUExecutionProvider"])
-    return lambda frames: np.stack([np.asarray(session.run(["filtered"], {"frame": frame})[0]) for frame in frames])
+
+    def filtered(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return np.asarray(session.run(["filtered"], {"frame": frame})[0])
+
+    pool = ThreadPoolExecutor(2)
+    return lambda frames: np.stack(list(pool.map(filtered, frames)))
 
 
 def _state_network(
@@ -142,24 +145,7 @@ def _state_network(
     if estimator is not None:
         return user_network(scene, Path(estimator)), None
     network, report = train_state_network(scene, filter_function(filter_part), seed, progress)
-    return exported(network.eval(), scene.camera.shape), report
-
-
-def exported(network: torch.nn.Module, shape: tuple[int, int]) -> onnx.GraphProto:
-    """A torch network of uint8 images [1, 1, height, width] as a graph."""
-    example = torch.zeros((1, 1, *shape), dtype=torch.uint8)
-    log = logging.getLogger("torch.onnx")
-    level = log.level
-    log.setLevel(logging.ERROR)  # it tells of torchvision's operators, which are not used
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", category=FutureWarning, module="copyreg")  # torch's own use of its pytree
-            program = torch.onnx.export(network, (example,), dynamo=True, opset_version=OPSET, optimize=True, verbose=False)
-    finally:
-        log.setLevel(level)
-    if program is None:
-        raise RuntimeError("torch.onnx.export gave no program")
-    return program.model_proto.graph
+    return state_graph(network, OPSET).graph, report
 
 
 def user_network(scene: Scene, path: Path) -> onnx.GraphProto:

@@ -2,8 +2,9 @@
 
 Markings are steep, so a mask is a few vertical runs (`build_model.pixel_mask`): with the sums of the frame down its columns, a run is
 counted by two look-ups, and a mask's score is the same affine map of the frame as the matrix product it replaces, at a fraction of
-its weights. GatherElements is the look-up, five times as fast as Gather in onnxruntime. The union of the passing cells' S is painted
-by the transpose of that map: +1 and -1 at the ends of the runs, summed down the columns.
+its weights. GatherElements is the look-up, five times as fast as Gather in onnxruntime; a product with a row of 1 and -1 adds up faster
+than ReduceSum. The union of the passing cells' S is painted by the transpose of that map: 1 and -1 at the ends of the runs, summed
+down the columns.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from build_model.filter_network import FilterTables, RunTable
+from build_model.filter_network import FilterTables
 from runtime.rounding import float32_above, float32_below
 from runtime.scene import Scene
 
@@ -52,8 +53,8 @@ class GraphWriter:
 def filter_graph(scene: Scene, tables: FilterTables) -> onnx.GraphProto:
     """The graph from `frame` and the two budgets to every output but `network_state` (table in `models/README.md`)."""
     g = GraphWriter()
-    crop, sums, witness_sums = _column_sums(g, scene, tables)
-    missed, extra = _scores(g, tables, sums, witness_sums)
+    crop, sums = _column_sums(g, scene, tables)
+    missed, extra = _scores(g, tables, _lit(g, tables, sums))
     _decide(g, tables, missed, extra)
     _filtered(g, scene, tables, crop)
     for name in LINE_BOXES:
@@ -75,8 +76,8 @@ def filter_graph(scene: Scene, tables: FilterTables) -> onnx.GraphProto:
     return helper.make_graph(g.nodes, "glideproof", inputs, outputs, g.constants)
 
 
-def _column_sums(g: GraphWriter, scene: Scene, tables: FilterTables) -> tuple[str, str, str]:
-    """The frame within the window, and the flat sums of frame and dilated frame down the columns, a row of zeros on top."""
+def _column_sums(g: GraphWriter, scene: Scene, tables: FilterTables) -> tuple[str, str]:
+    """The frame within the window (int32), and the flat sums down its columns, those of the dilated frame behind, if there is one."""
     window, tolerance = tables.window, scene.tolerance.line_px
     g.whole("rows_and_columns", 0, 1)
     first, stop = g.whole("window_first", window.top, window.left), g.whole("window_stop", window.bottom, window.right)
@@ -84,40 +85,50 @@ def _column_sums(g: GraphWriter, scene: Scene, tables: FilterTables) -> tuple[st
     g.constant("down", np.array(0, dtype=np.int64))
     g.whole("flat", -1)
     crop = g.node("Slice", "crop", "frame", first, stop, "rows_and_columns")
-    sums = _sums(g, "frame", crop)
+    counted, sums = _sums(g, "frame", crop)
     if tolerance == 0:
-        return crop, sums, sums
+        return counted, sums
     g.whole("image_axes", 0, 1)
     image = g.node("Unsqueeze", "crop_image", crop, "image_axes")
     dilated = g.node("MaxPool", "dilated_image", image, kernel_shape=[2 * tolerance + 1] * 2, pads=[tolerance] * 4, strides=[1, 1])
-    return crop, sums, _sums(g, "dilated", g.node("Squeeze", "dilated", dilated, "image_axes"))
+    _, witness_sums = _sums(g, "dilated", g.node("Squeeze", "dilated", dilated, "image_axes"))
+    return counted, g.node("Concat", "frame_and_witness_sums", sums, witness_sums, axis=0)
 
 
-def _sums(g: GraphWriter, name: str, pixels: str) -> str:
+def _sums(g: GraphWriter, name: str, pixels: str) -> tuple[str, str]:
+    """The pixels as int32, and their flat sums down the columns, under a row of zeros."""
     counted = g.node("Cast", f"{name}_counted", pixels, to=TensorProto.INT32)
     padded = g.node("Pad", f"{name}_padded", counted, "row_of_zeros")
-    return g.node("Reshape", f"{name}_sums", g.node("CumSum", f"{name}_column_sums", padded, "down"), "flat")
+    return counted, g.node("Reshape", f"{name}_sums", g.node("CumSum", f"{name}_column_sums", padded, "down"), "flat")
 
 
-def _lit(g: GraphWriter, name: str, sums: str, table: RunTable, shape: str) -> str:
-    """Lit pixels of every mask, in the given shape."""
-    totals = []
-    layout = g.whole(f"{name}_layout", *table.start.shape)
-    for side in ("stop", "start"):
-        index = g.constant(f"{name}_{side}", getattr(table, side).ravel())
-        looked_up = g.node("Reshape", f"{name}_{side}_table", g.node("GatherElements", f"{name}_{side}_sums", sums, index), layout)
-        totals.append(g.node("ReduceSum", f"{name}_{side}_total", looked_up, "first_axis", keepdims=0))
-    return g.node("Reshape", f"{name}_lit", g.node("Sub", f"{name}_lit_flat", *totals), shape)
+def _lit(g: GraphWriter, tables: FilterTables, sums: str) -> str:
+    """Lit pixels of every mask, flat, in the order of the run table."""
+    total, masks = "", tables.runs.blocks[0].shape[2]
+    for number, block in enumerate(tables.runs.blocks):
+        _, runs, reached = block.shape
+        looked_up = g.node("GatherElements", f"looked_up_{number}", sums, g.constant(f"runs_{number}", block.ravel()))
+        ends = g.node("Reshape", f"run_ends_{number}", looked_up, g.whole(f"run_layout_{number}", 2 * runs, reached))
+        signs = g.constant(f"stop_minus_start_{number}", np.repeat(np.array([[1, -1]], dtype=np.int32), runs, axis=1))
+        lit = g.node("MatMul", f"lit_{number}", signs, ends)
+        if number:
+            wide = g.node("Pad", f"lit_wide_{number}", lit, g.whole(f"masks_beyond_{number}", 0, 0, 0, masks - reached))
+            lit = g.node("Add", f"lit_so_far_{number}", total, wide)
+        total = lit
+    return g.node("Reshape", "lit", total, "flat")
 
 
-def _scores(g: GraphWriter, tables: FilterTables, sums: str, witness_sums: str) -> tuple[str, str]:
+def _scores(g: GraphWriter, tables: FilterTables, lit: str) -> tuple[str, str]:
     """missed = |K| - lit K (among witnesses) and extra = lit S - lit O of every entry, (cells, entries)."""
     g.whole("first_axis", 0)
-    by_entry, by_cell = g.whole("by_entry", len(tables.cells), tables.entries), g.whole("by_cell", len(tables.cells), 1)
-    size = g.constant("must_light_size", tables.must_light_size)
-    missed = g.node("Sub", "missed", size, _lit(g, "must_light", witness_sums, tables.must_light, by_entry))
-    spatial, may_light = _lit(g, "spatial", sums, tables.spatial, by_cell), _lit(g, "may_light", sums, tables.may_light, by_entry)
-    return missed, g.node("Sub", "extra", spatial, may_light)
+    shapes = {"spatial": g.whole("by_cell", len(tables.cells), 1)}
+    shapes |= dict.fromkeys(("must_light", "may_light"), g.whole("by_entry", len(tables.cells), tables.entries))
+    counts = {}
+    for name, shape in shapes.items():
+        place = g.constant(f"{name}_place", getattr(tables.runs, name).ravel())
+        counts[name] = g.node("Reshape", f"{name}_lit", g.node("GatherElements", f"{name}_lit_flat", lit, place), shape)
+    missed = g.node("Sub", "missed", g.constant("must_light_size", tables.must_light_size), counts["must_light"])
+    return missed, g.node("Sub", "extra", counts["spatial"], counts["may_light"])
 
 
 def _decide(g: GraphWriter, tables: FilterTables, missed: str, extra: str) -> None:
@@ -136,40 +147,36 @@ def _decide(g: GraphWriter, tables: FilterTables, missed: str, extra: str) -> No
     g.node("Greater", "some_pass", most, zero)
     best = g.node("ArgMax", "most_supported", "support", axis=0, keepdims=0)
     g.node("Where", "cell", "some_pass", best, g.node("ArgMin", "least_mismatch", "mismatch", axis=0, keepdims=0))
-    _hull(g, "lower", tables.state_lower, float32_below(tables.cells.lower), "ReduceMin", np.inf)
-    _hull(g, "upper", tables.state_upper, float32_above(tables.cells.upper), "ReduceMax", -np.inf)
+    nothing, infinite = g.constant("no_distance", np.array(0, dtype=np.float32)), g.constant("infinite", np.array(np.inf, dtype=np.float32))
+    g.node("Where", "removed_by", passes, nothing, infinite)
+    _hull(g, "lower", tables.state_lower, float32_below(tables.cells.lower), "Add", "ReduceMin")
+    _hull(g, "upper", tables.state_upper, float32_above(tables.cells.upper), "Sub", "ReduceMax")
 
 
-def _hull(g: GraphWriter, side: str, states: NDArray, cells: NDArray, extreme: str, neutral: float) -> None:
-    """cell_lower or cell_upper: the extreme over the passing entries, the cell's own side where none passes."""
+def _hull(g: GraphWriter, side: str, states: NDArray, cells: NDArray, remove: str, extreme: str) -> None:
+    """cell_lower or cell_upper: the extreme over the passing entries, the others moved out of its way to infinity.
+
+    The cell's own side where none passes.
+    """
     by_axis = g.constant(f"state_{side}", states.transpose(2, 0, 1))
-    absent = g.constant(f"absent_{side}", np.array(neutral, dtype=np.float32))
-    g.whole(f"{side}_axis", 2)
-    candidates = g.node("Where", f"{side}_candidates", "passes", by_axis, absent)
-    hull = g.node(extreme, f"{side}_hull", candidates, f"{side}_axis", keepdims=0)
-    whole = g.constant(f"whole_{side}", cells.T)
-    chosen = g.node("Where", f"{side}_by_axis", "passing", hull, whole)
+    candidates = g.node(remove, f"{side}_candidates", by_axis, "removed_by")
+    hull = g.node(extreme, f"{side}_hull", candidates, g.whole(f"{side}_axis", 2), keepdims=0)
+    chosen = g.node("Where", f"{side}_by_axis", "passing", hull, g.constant(f"whole_{side}", cells.T))
     g.node("Transpose", f"cell_{side}", chosen, perm=[1, 0])
 
 
 def _filtered(g: GraphWriter, scene: Scene, tables: FilterTables, crop: str) -> None:
     """filtered = frame within the union of S over the passing cells, or within S of `cell` where none passes."""
-    window, table = tables.window, tables.spatial
-    rows, columns = window.shape
-    run, cell = np.nonzero(table.stop != table.start)
-    ends = np.concatenate([table.start[run, cell], table.stop[run, cell]])
+    window, runs = tables.window, tables.spatial_runs
     g.constant("cell_numbers", np.arange(len(tables.cells), dtype=np.int64))
     alone = g.node("And", "cell_alone", g.node("Equal", "is_cell", "cell_numbers", "cell"), g.node("Not", "none_passes", "some_pass"))
     chosen = g.node("Cast", "chosen", g.node("Or", "shown", "passing", alone), to=TensorProto.INT32)
-    starts = g.node("GatherElements", "run_starts", chosen, g.constant("run_cells", cell.astype(np.int64)))
-    steps = g.node("Concat", "run_steps", starts, g.node("Neg", "run_stops", starts), axis=0)
-    blank = g.constant("blank", np.zeros((rows + 1) * columns, dtype=np.int32))
-    index = g.constant("run_ends", ends.astype(np.int64))
+    shown = g.node("GatherElements", "shown_runs", chosen, g.constant("spatial_run_cell", runs.cell))
+    steps = g.node("Mul", "shown_steps", shown, g.constant("spatial_run_step", runs.step))
+    blank = g.constant("blank", np.zeros(np.prod(window.shape), dtype=np.int32))
+    index = g.constant("spatial_run_index", runs.index)
     painted = g.node("ScatterElements", "painted_flat", blank, index, steps, axis=0, reduction="add")
-    painted = g.node("Reshape", "painted", painted, g.whole("painted_shape", rows + 1, columns))
-    cover = g.node("CumSum", "cover", painted, "down")
-    cover = g.node("Slice", "cover_rows", cover, g.whole("first_row", 0), g.whole("stop_row", rows), "first_axis")
-    mask = g.node("Cast", "mask", g.node("Greater", "covered", cover, "zero"), to=TensorProto.UINT8)
+    cover = g.node("CumSum", "cover", g.node("Reshape", "painted", painted, g.whole("window_shape", *window.shape)), "down")
+    kept = g.node("Cast", "filtered_crop", g.node("Min", "covered", crop, cover), to=TensorProto.UINT8)
     height, width = scene.camera.shape
-    border = g.whole("border", window.top, window.left, height - window.bottom, width - window.right)
-    g.node("Pad", "filtered", g.node("Mul", "filtered_crop", crop, mask), border)
+    g.node("Pad", "filtered", kept, g.whole("border", window.top, window.left, height - window.bottom, width - window.right))

@@ -113,8 +113,8 @@ class RowConvolution(nn.Module):
 
     def forward(self, image: Tensor) -> Tensor:
         """`image`: float32 (n, rows, columns), rows a multiple of BLOCK_ROWS. Returns (n, channels, rows / BLOCK_ROWS - 1)."""
-        halves = self.halves(image.reshape(len(image), image.shape[1] // BLOCK_ROWS, -1))
-        return (halves[:, :-1, : self.channels] + halves[:, 1:, self.channels :]).transpose(1, 2)
+        upper, lower = self.halves(image.reshape(len(image), image.shape[1] // BLOCK_ROWS, -1)).split(self.channels, dim=2)
+        return (upper[:, :-1] + lower[:, 1:]).transpose(1, 2)
 
 
 class StateNetwork(nn.Module):
@@ -130,7 +130,7 @@ class StateNetwork(nn.Module):
     def __init__(self, scene: Scene) -> None:
         super().__init__()
         self.frame_shape = scene.camera.shape
-        self.window = domain_window(scene)
+        self.window = in_whole_blocks(domain_window(scene), scene.camera.height)
         rows, columns = self.window.shape
         blocks = max(2, -(-rows // BLOCK_ROWS))
         self.padding = blocks * BLOCK_ROWS - rows
@@ -150,7 +150,7 @@ class StateNetwork(nn.Module):
     def forward(self, filtered: Tensor) -> Tensor:
         """`filtered`: (n, 1, height, width) of {0, 1}, uint8 or float. Returns (n, 4) float32: theta (rad), x, y, z (m)."""
         rows, columns = self.window.slices
-        image = filtered[:, :, rows, columns].squeeze(1).to(torch.float32)
+        image = filtered[:, :, :, columns][:, :, rows].squeeze(1).to(torch.float32)  # the export slices one axis at a time: narrowest first
         return self.middle + self.half_width * self.normalised(image)
 
     def normalised(self, image: Tensor) -> Tensor:
@@ -186,6 +186,14 @@ def domain_window(scene: Scene) -> Window:
     """The smallest window that holds S of every cell: what lies outside it is dark in every filtered frame."""
     cells = partition(scene)
     return reduce(Window.union, (spatial_filter(scene, lower, upper)[1] for lower, upper in zip(cells.lower, cells.upper, strict=True)))
+
+
+def in_whole_blocks(window: Window, height: int) -> Window:
+    """The window with rows added, below it first, to a multiple of BLOCK_ROWS or as far as the frame's height allows."""
+    lacking = -window.shape[0] % BLOCK_ROWS
+    below = min(lacking, height - window.bottom)
+    above = min(lacking - below, window.top)
+    return Window(window.top - above, window.bottom + below, window.left, window.right)
 
 
 @dataclass(frozen=True)

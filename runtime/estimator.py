@@ -186,8 +186,11 @@ class Estimator:
         )
 
     def _witnesses(self, pixels: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """The frame dilated by the tolerance: lit where a lit pixel lies within `line_px` in the sup norm."""
-        return dilated(pixels.view(np.bool_), self.scene.tolerance.line_px)
+        """Lit where a lit pixel lies within `line_px` in the sup norm, or the frame ends: the camera may see that point outside of it."""
+        radius = self.scene.tolerance.line_px
+        height, width = pixels.shape
+        wide = dilated(np.pad(pixels.view(np.bool_), radius, constant_values=True), radius)
+        return wide[radius : radius + height, radius : radius + width]
 
     def _regions(self, pieces: StateSet) -> tuple[Box, ...]:
         """Boxes of the connected parts of the pieces."""

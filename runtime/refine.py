@@ -22,14 +22,14 @@ from numpy.typing import NDArray
 
 from runtime.rounding import OUTWARD_PX, above, below, inverted
 from runtime.scene import Scene
-from runtime.state_set import Floats, StateSet, altitude_range, column_range, end_rows, fall_range, reach, scale_ratio, tangent_of_row
+from runtime.state_set import Floats, StateSet, column_range, end_rows, reference_fall_range, scale_ratio, tangent_of_row
 
 Bits = NDArray[np.bool_]
 Rows = NDArray[np.int64]
 
-CUTS = (2, 4, 4)
+CUTS = (2, 4)
 """Slices of theta that every piece is cut into, round after round."""
-FACE_ROUNDS, FACE_PIECES, FACE_CUTS = 2, 3, (2, 3)
+FACE_ROUNDS, FACE_PIECES, FACE_CUTS = 2, 2, (4, 3)
 """Last rounds: how many, how many pieces a face of the box, and into how many slices of theta and of z each is cut."""
 LARGEST_START = 512
 """More passing entries than this say that the frame tells next to nothing: they are left as they are, at a bounded cost."""
@@ -55,93 +55,85 @@ class Refiner:
         canvas = np.pad(frame, 1, constant_values=True)
         pieces = entries
         for cuts in CUTS:
-            pieces = self._contract(canvas, _cut(pieces, "theta", cuts))
+            pieces = self._contracted(canvas, _cut(pieces, theta=cuts))
         for _ in range(FACE_ROUNDS):
             outer = _carries_a_face(pieces, FACE_PIECES)
-            finer = _cut(_cut(pieces[outer], "theta", FACE_CUTS[0]), "z", FACE_CUTS[1])
-            pieces = _joined(self._contract(canvas, finer), pieces[~outer])
+            finer = self._contracted(canvas, _cut(pieces[outer], theta=FACE_CUTS[0], z=FACE_CUTS[1]))
+            pieces = _joined(finer, pieces[~outer])
         return pieces
 
-    def _contract(self, canvas: Bits, sets: StateSet) -> StateSet:
-        """The sets without most of the states that the frame contradicts; sets that are left empty are dropped."""
+    def _contracted(self, canvas: Bits, sets: StateSet) -> StateSet:
+        """The sets, whose arrays are overwritten, without most of the states that the frame contradicts, and without empty sets."""
         if len(sets) == 0:
             return sets
-        sets = self._within_altitudes(sets)
+        self._by_altitude(sets)
         grid = _Grid.of(self.scene, sets)
         lit = _lit_columns(self.scene, canvas, sets, grid)
         offset = self._offsets(grid, lit)
-        narrowed = self._within_offsets(sets, offset)
-        narrowed = self._within_ends(narrowed, grid, lit)
-        narrowed = self._within_altitudes(narrowed)
-        empty = inverted(*offset).any(axis=1)
-        for name in ("x", "y", "z", "scale"):
-            empty |= inverted(*getattr(narrowed, name).T)
-        return narrowed[~empty]
+        self._by_offset(sets, offset)
+        self._by_ends(sets, grid, lit)
+        self._by_altitude(sets)
+        low = np.concatenate([offset[0].T, [sets.x[:, 0], sets.y[:, 0], sets.z[:, 0], sets.scale[:, 0]]])
+        high = np.concatenate([offset[1].T, [sets.x[:, 1], sets.y[:, 1], sets.z[:, 1], sets.scale[:, 1]]])
+        return sets[~inverted(low, high).any(axis=0)]
 
-    def _within_altitudes(self, sets: StateSet) -> StateSet:
+    def _by_altitude(self, sets: StateSet) -> None:
         """Draws y and scale in by y = F s(theta, t_ref) / scale."""
         focal = self.scene.camera.focal_px
-        fall_low, fall_high = fall_range(sets.theta, sets.tangent)
-        scale = _intersection(sets.scale, focal * fall_low / sets.y[:, 1], focal * fall_high / sets.y[:, 0])
-        sets = replace(sets, scale=scale)
-        return replace(sets, y=_intersection(sets.y, *altitude_range(self.scene.camera, sets)))
+        fall_low, fall_high = reference_fall_range(sets)
+        _draw_in(sets.scale, focal * fall_low / sets.y[:, 1], focal * fall_high / sets.y[:, 0])
+        _draw_in(sets.y, focal * fall_low / sets.scale[:, 1], focal * fall_high / sets.scale[:, 0])
 
     def _offsets(self, grid: _Grid, lit: _LitColumns) -> tuple[Floats, Floats]:
         """Bounds on the offset (p_x - x) scale of each marking, (sets, markings), from the row borders that all states cross."""
         u0 = self.scene.camera.u0
-        ratio_low, ratio_high = (part[:, None, :] for part in grid.ratio)
-        low = np.full(grid.crossed.shape, -NO_BOUND)
-        high = np.full(grid.crossed.shape, NO_BOUND)
-        low[..., 1:-1] = np.maximum(lit.first[..., :-1], lit.first[..., 1:]) - u0 - OUTWARD_PX
-        high[..., 1:-1] = np.minimum(lit.last[..., :-1], lit.last[..., 1:]) + 1 - u0 + OUTWARD_PX
-        safe_low, safe_high = np.where(grid.crossed, ratio_low, 1.0), np.where(grid.crossed, ratio_high, 1.0)
-        low = np.where(grid.crossed, np.minimum(low / safe_low, low / safe_high), -NO_BOUND)
-        high = np.where(grid.crossed, np.maximum(high / safe_low, high / safe_high), NO_BOUND)
+        low = np.maximum(lit.first[..., :-1], lit.first[..., 1:]) - (u0 + OUTWARD_PX)
+        high = np.minimum(lit.last[..., :-1], lit.last[..., 1:]) + (1 - u0 + OUTWARD_PX)
+        slow, fast = (1 / ratio[:, None, 1:-1] for ratio in grid.ratio)
+        low = np.where(grid.crossed, np.minimum(low * slow, low * fast), -NO_BOUND)
+        high = np.where(grid.crossed, np.maximum(high * slow, high * fast), NO_BOUND)
         spoiled = 2 * self.missed_budget
         return _largest_but(low, spoiled), -_largest_but(-high, spoiled)
 
-    def _within_offsets(self, sets: StateSet, offset: tuple[Floats, Floats]) -> StateSet:
+    def _by_offset(self, sets: StateSet, offset: tuple[Floats, Floats]) -> None:
         """Draws scale and x in by offset = (p_x - x) scale: marking by marking, and by the differences of markings, free of x."""
         x_m = self.scene.runway.x_m
         low, high = offset
-        scale, x = sets.scale, sets.x
-        for marking, position in enumerate(x_m):
-            across = position - x[:, ::-1]
-            scale = _intersection(scale, *_quotient(low[:, marking], high[:, marking], across))
-        free = bool((x[:, 1] > x[:, 0]).any())
-        if free:
-            for left, right in zip(*np.triu_indices(len(x_m), 1), strict=True):
-                apart = np.full(2, x_m[right] - x_m[left])
-                scale = _intersection(scale, *_quotient(low[:, right] - high[:, left], high[:, right] - low[:, left], apart))
-            positive = np.maximum(scale, 1 / NO_BOUND)
-            for marking, position in enumerate(x_m):
-                across_low, across_high = _quotient(low[:, marking], high[:, marking], positive)
-                x = _intersection(x, position - across_high, position - across_low)
-        return replace(sets, scale=scale, x=x)
+        scale_low, scale_high = _quotient(low, high, x_m[:, None] - sets.x[:, None, ::-1])
+        _draw_in(sets.scale, scale_low.max(axis=1), scale_high.min(axis=1))
+        if (sets.x[:, 1] <= sets.x[:, 0]).all():
+            return
+        for left, right in zip(*np.triu_indices(len(x_m), 1), strict=True):
+            apart = np.full(2, x_m[right] - x_m[left])
+            _draw_in(sets.scale, *_quotient(low[:, right] - high[:, left], high[:, right] - low[:, left], apart))
+        across_low, across_high = _quotient(low, high, np.maximum(sets.scale, 1 / NO_BOUND)[:, None, :])
+        _draw_in(sets.x, (x_m - across_high).max(axis=1), (x_m - across_low).min(axis=1))
 
-    def _within_ends(self, sets: StateSet, grid: _Grid, lit: _LitColumns) -> StateSet:
+    def _by_ends(self, sets: StateSet, grid: _Grid, lit: _LitColumns) -> None:
         """Draws z in: a marking does not go on past the (m + 1)-th row that shows no pixel it could light."""
-        dark = lit.last < lit.first
         row = grid.rows[:, None, :-1]
-        below_near = dark & (row + 1 > grid.near[0][..., None]) & (row >= grid.far[1][..., None])
-        beyond_far = dark & (row < grid.far[1][..., None]) & (row + 1 <= grid.near[0][..., None])
+        near_low, far_high = grid.near[0][..., None], grid.far[1][..., None]
+        dark = lit.last < lit.first
+        before_near, behind_far = row + 1 <= near_low, row >= far_high
+        stops, starts = dark & behind_far & ~before_near, dark & before_near & ~behind_far
         budget = self.missed_budget + 1
-        stop = np.where(below_near & (below_near.cumsum(axis=2) == budget), row, NO_ROW).min(axis=2)
-        start = np.where(beyond_far & (beyond_far[..., ::-1].cumsum(axis=2)[..., ::-1] == budget), row + 1, -NO_ROW).max(axis=2)
-        z = sets.z
-        for marking, (near_z, far_z) in enumerate(self.scene.runway.ends_z_m):
-            last = np.minimum(stop[:, marking], above(grid.near[1][:, marking]))
-            first = np.maximum(start[:, marking], below(grid.far[0][:, marking]))
-            z = _intersection(z, self._distances(sets, last)[0] - near_z, self._distances(sets, first)[1] - far_z)
-        return replace(sets, z=z)
+        if budget > 1:
+            stops &= stops.cumsum(axis=2) == budget
+            starts &= starts[..., ::-1].cumsum(axis=2)[..., ::-1] == budget
+        last = np.minimum(np.where(stops, row, NO_ROW).min(axis=2), above(grid.near[1]))
+        first = np.maximum(np.where(starts, row + 1, -NO_ROW).max(axis=2), below(grid.far[0]))
+        distance_low, distance_high = self._distances(sets, np.concatenate([last, first], axis=1))
+        ends_z, markings = self.scene.runway.ends_z_m, last.shape[1]
+        _draw_in(sets.z, (distance_low[:, :markings] - ends_z[:, 0]).max(axis=1), (distance_high[:, markings:] - ends_z[:, 1]).min(axis=1))
 
     def _distances(self, sets: StateSet, row: Floats) -> tuple[Floats, Floats]:
-        """Range of the distance d = F (cos(theta) - t sin(theta)) / (scale R) of the ground at a row, (sets,) each."""
+        """Range of the distance d = F (cos(theta) - t sin(theta)) / (scale R) of the ground at rows (sets, rows)."""
         tangent = tangent_of_row(self.scene.camera, row)
-        low, high = scale_ratio(sets, tangent[:, None])
-        far, near = reach(sets.theta[:, 0], tangent), reach(sets.theta[:, 1], tangent)
+        low, high = scale_ratio(sets, tangent)
+        cosine, sine = sets.turn
+        far, near = cosine[:, :1] - sine[:, :1] * tangent, cosine[:, 1:] - sine[:, 1:] * tangent
         focal, tiny = self.scene.camera.focal_px, 1 / NO_BOUND
-        slow, fast = np.maximum(sets.scale[:, 0] * low[:, 0], tiny), np.maximum(sets.scale[:, 1] * high[:, 0], tiny)
+        slow, fast = np.maximum(sets.scale[:, :1] * low, tiny), np.maximum(sets.scale[:, 1:] * high, tiny)
         return focal * np.minimum(near / fast, near / slow), focal * np.maximum(far / slow, far / fast)
 
 
@@ -149,8 +141,8 @@ class Refiner:
 class _Grid:
     """The rows that each set can show: `rows` (sets, n + 1) are borders; row i lies between borders i and i + 1.
 
-    `ratio` bounds R there; `near` and `far` bound the ends of each marking, (sets, markings), px; `crossed` (sets, markings, n + 1) says
-    where all states of the set cross the border.
+    `ratio` bounds R there; `near` and `far` bound the ends of each marking, (sets, markings), px; `crossed` (sets, markings, n - 1) says
+    which of the inner borders all states of the set cross.
     """
 
     rows: Rows
@@ -161,23 +153,25 @@ class _Grid:
 
     @staticmethod
     def of(scene: Scene, sets: StateSet) -> _Grid:
-        near, far = (_ends(scene, sets, end) for end in (0, 1))
+        near, far = _ends(scene, sets)
         first = np.floor(below(far[0].min(axis=1))).astype(np.int64)
         count = int((np.floor(above(near[1].max(axis=1))) - first).max()) + 1
         rows = first[:, None] + np.arange(count + 1)
         ratio = scale_ratio(sets, tangent_of_row(scene.camera, rows))
-        border = rows[:, None, :]
-        crossed = (border > above(far[1])[..., None]) & (border < below(near[0])[..., None])
-        crossed &= (ratio[0] > 0)[:, None, :]
-        crossed[..., 0] = crossed[..., -1] = False
+        inner = rows[:, None, 1:-1]
+        crossed = (inner > above(far[1])[..., None]) & (inner < below(near[0])[..., None])
+        if not (ratio[0] > 0).all():
+            crossed &= (ratio[0] > 0)[:, None, 1:-1]
+            ratio = np.maximum(ratio[0], 1 / NO_BOUND), np.maximum(ratio[1], 1 / NO_BOUND)
         return _Grid(rows, ratio, near, far, crossed)
 
 
-def _ends(scene: Scene, sets: StateSet, end: int) -> tuple[Floats, Floats]:
-    """Range of the row of each marking's near (0) or far (1) end, (sets, markings) each; equal distances are computed once."""
-    distances, which = np.unique(scene.runway.ends_z_m[:, end], return_inverse=True)
-    low, high = zip(*(end_rows(scene.camera, sets, float(distance)) for distance in distances), strict=True)
-    return np.stack(low, axis=1)[:, which], np.stack(high, axis=1)[:, which]
+def _ends(scene: Scene, sets: StateSet) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
+    """Ranges of the rows of each marking's near and far end, (sets, markings) each; equal distances are computed once."""
+    distances = sorted(set(scene.runway.ends_z_m.flat))
+    low, high = end_rows(scene.camera, sets, distances)
+    near, far = ([distances.index(end) for end in ends] for ends in scene.runway.ends_z_m.T)
+    return (low[:, near], high[:, near]), (low[:, far], high[:, far])
 
 
 @dataclass(frozen=True)
@@ -196,13 +190,14 @@ def _lit_columns(scene: Scene, canvas: Bits, sets: StateSet, grid: _Grid) -> _Li
     first = np.floor(below(np.minimum(low[..., :-1], low[..., 1:]))).astype(np.int64)
     last = np.floor(above(np.maximum(high[..., :-1], high[..., 1:]))).astype(np.int64)
     height, width = scene.camera.shape
-    row = np.clip(grid.rows[:, None, :-1], -1, height) + 1
+    row_start = (np.clip(grid.rows[:, None, :-1], -1, height) + 1) * (width + 2) + 1
+    pixels = canvas.ravel()
     lowest, highest = np.full(first.shape, NO_BOUND), np.full(first.shape, -NO_BOUND)
-    for step in range(int((last - first).max()), -1, -1):
+    for step in range(int((last - first).max()) + 1):
         column = first + step
-        lit = canvas[row, np.clip(column, -1, width) + 1] & (column <= last)
-        lowest = np.where(lit, column, lowest)
-        highest = np.where(lit & (highest < 0), column, highest)
+        lit = pixels.take(row_start + np.clip(column, -1, width)) & (column <= last)
+        np.minimum(lowest, column, out=lowest, where=lit)
+        np.copyto(highest, column, where=lit)
     return _LitColumns(lowest, highest)
 
 
@@ -215,27 +210,34 @@ def _largest_but(values: Floats, count: int) -> Floats:
     return np.partition(values, -count - 1, axis=-1)[..., -count - 1]
 
 
-def _intersection(interval: Floats, low: Floats, high: Floats) -> Floats:
-    return np.stack([np.maximum(interval[:, 0], low), np.minimum(interval[:, 1], high)], axis=-1)
+def _draw_in(interval: Floats, low: Floats, high: Floats) -> None:
+    """Intersects intervals (sets, 2) with [low, high] in place."""
+    np.maximum(interval[:, 0], low, out=interval[:, 0])
+    np.minimum(interval[:, 1], high, out=interval[:, 1])
 
 
 def _quotient(low: Floats, high: Floats, divisor: Floats) -> tuple[Floats, Floats]:
     """Range of [low, high] / divisor (..., 2) where the divisor has one sign; no bound where it has not."""
     near, far = divisor[..., 0], divisor[..., 1]
     usable = near * far > 0
-    near, far = np.where(usable, near, 1.0), np.where(usable, far, 1.0)
-    corners = np.stack([low / near, low / far, high / near, high / far])
-    return np.where(usable, corners.min(axis=0), -NO_BOUND), np.where(usable, corners.max(axis=0), NO_BOUND)
+    if not usable.all():
+        near, far = np.where(usable, near, 1.0), np.where(usable, far, 1.0)
+        low, high = np.where(usable, low, -NO_BOUND), np.where(usable, high, NO_BOUND)
+    near, far = 1 / near, 1 / far
+    smallest = np.minimum(np.minimum(low * near, low * far), np.minimum(high * near, high * far))
+    return smallest, np.maximum(np.maximum(low * near, low * far), np.maximum(high * near, high * far))
 
 
-def _cut(sets: StateSet, axis: str, parts: int) -> StateSet:
-    """Every set as `parts` sets of equal extent along theta or z; neighbours share their borders to the last bit."""
-    which = np.repeat(np.arange(len(sets)), parts)
-    interval = getattr(sets, axis)
-    edges = interval[:, :1] + (interval[:, 1:] - interval[:, :1]) * (np.arange(parts + 1) / parts)
-    edges[:, -1] = interval[:, 1]
-    sides = np.stack([edges[:, :-1].ravel(), edges[:, 1:].ravel()], axis=-1)
-    return replace(sets[which], **{axis: sides})
+def _cut(sets: StateSet, **parts: int) -> StateSet:
+    """A copy with every set cut into equal parts along the named axes; neighbours share their borders to the last bit."""
+    for axis, count in parts.items():
+        which = np.repeat(np.arange(len(sets)), count)
+        interval = getattr(sets, axis)
+        edges = interval[:, :1] + (interval[:, 1:] - interval[:, :1]) * (np.arange(count + 1) / count)
+        edges[:, -1] = interval[:, 1]
+        sides = np.stack([edges[:, :-1].ravel(), edges[:, 1:].ravel()], axis=-1)
+        sets = replace(sets[which], **{axis: sides})
+    return sets
 
 
 def _joined(first: StateSet, second: StateSet) -> StateSet:
@@ -246,9 +248,11 @@ def _joined(first: StateSet, second: StateSet) -> StateSet:
 def _carries_a_face(sets: StateSet, pieces: int) -> Bits:
     """True for the `pieces` sets that reach farthest on each side of theta, y and z."""
     chosen = np.zeros(len(sets), dtype=bool)
+    if len(sets) <= pieces:
+        return ~chosen
     for bound in (sets.theta, sets.y, sets.z):
-        for values in (bound[:, 0], -bound[:, 1]):
-            chosen[np.argsort(values)[:pieces]] = True
+        chosen[np.argpartition(bound[:, 0], pieces)[:pieces]] = True
+        chosen[np.argpartition(-bound[:, 1], pieces)[:pieces]] = True
     return chosen
 
 

@@ -259,7 +259,7 @@ class EstimatorTraining:
     """How NN_e is trained (`build_model.state_network`): frames made by the supercover, with clutter and missed pixels."""
 
     training_frames: int = 60_000
-    epochs: int = 12
+    epochs: int = 10
     batch: int = 128
     largest_clutter: float = 0.06
     """Densities of random clutter are drawn from 0 to this."""

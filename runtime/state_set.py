@@ -17,12 +17,13 @@ plain float64 bounds; `runtime.rounding` turns them outward.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from runtime.camera import row_of_point
 from runtime.scene import Camera
 
 Floats = NDArray[np.float64]
@@ -46,7 +47,17 @@ class StateSet:
         return len(self.theta)
 
     def __getitem__(self, index: NDArray) -> StateSet:
-        return StateSet(*(getattr(self, name)[index] for name in ("theta", "x", "y", "z", "scale", "tangent")))
+        return StateSet(self.theta[index], self.x[index], self.y[index], self.z[index], self.scale[index], self.tangent[index])
+
+    @cached_property
+    def turn(self) -> tuple[Floats, Floats]:
+        """Cosine and sine of theta, (sets, 2) each."""
+        return np.cos(self.theta), np.sin(self.theta)
+
+    @cached_property
+    def reference_fall(self) -> Floats:
+        """s(theta, t_ref) at both ends of theta, (sets, 2)."""
+        return self.turn[0] * self.tangent[:, None] + self.turn[1]
 
     @property
     def lower(self) -> Floats:
@@ -95,41 +106,62 @@ def contract(camera: Camera, sets: StateSet) -> StateSet:
     theta_low = np.maximum(sets.theta[:, 0], np.arcsin(np.clip(sine_low, 0, 1)) - phi)
     rises = reach(sets.theta[:, 1], tangent) >= 0  # up to straight down the sine bounds the angle from above too
     theta_high = np.where(rises, np.minimum(sets.theta[:, 1], np.arcsin(np.clip(sine_high, 0, 1)) - phi), sets.theta[:, 1])
-    theta = np.stack([theta_low, np.maximum(theta_high, theta_low - 1)], axis=-1)
-    y_low, y_high = altitude_range(camera, replace(sets, theta=theta))
-    y = np.stack([np.maximum(sets.y[:, 0], y_low), np.minimum(sets.y[:, 1], y_high)], axis=-1)
-    return replace(sets, theta=theta, y=y)
+    drawn_in = replace(sets, theta=np.stack([theta_low, theta_high], axis=-1))
+    y_low, y_high = altitude_range(camera, drawn_in)
+    return replace(drawn_in, y=np.stack([np.maximum(sets.y[:, 0], y_low), np.minimum(sets.y[:, 1], y_high)], axis=-1))
+
+
+def reference_fall_range(sets: StateSet) -> tuple[Floats, Floats]:
+    """Exact range of s(theta, t_ref) over each set, (sets,) each."""
+    low, high = np.minimum(*sets.reference_fall.T), np.maximum(*sets.reference_fall.T)
+    (cosine_low, cosine_high), (sine_low, sine_high) = sets.turn[0].T, sets.turn[1].T
+    peaks = (cosine_low >= sine_low * sets.tangent) & (cosine_high <= sine_high * sets.tangent)
+    return low, np.where(peaks, np.sqrt(1 + sets.tangent**2), high) if peaks.any() else high
 
 
 def altitude_range(camera: Camera, sets: StateSet) -> tuple[Floats, Floats]:
     """Range of y = F s(theta, t_ref) / scale over theta and scale alone, (sets,) each."""
-    low, high = fall_range(sets.theta, sets.tangent)
+    low, high = reference_fall_range(sets)
     return camera.focal_px * low / sets.scale[:, 1], camera.focal_px * high / sets.scale[:, 0]
 
 
-def end_rows(camera: Camera, sets: StateSet, end_z_m: float) -> tuple[Floats, Floats]:
-    """Range of the row of a marking's end, (sets,) each, px: v0 + F tan(beta - theta), beta = atan2(y, end_z_m + z).
+def end_rows(camera: Camera, sets: StateSet, end_z_m: ArrayLike) -> tuple[Floats, Floats]:
+    """Range of the row of a marking's end, px: v0 + F tan(beta - theta), beta = atan2(y, end_z_m + z).
 
-    Over the box (theta, y, z) the row falls in theta and z and rises in y. At one scale y follows theta, and
-    d(beta - theta)/dtheta = sin(beta) cos(beta) cot(psi_ref) - 1: where that is negative for all altitudes that theta and scale
-    allow, the row falls in theta and in the scale, which bounds it far more closely. Both bounds hold; the closer one is returned.
+    `end_z_m`: a number, or several (ends,); returns (sets,) or (sets, ends) each. Over the box (theta, y, z) the row falls in theta and
+    z and rises in y. At one scale y follows theta, and d(beta - theta)/dtheta = sin(beta) cos(beta) cot(psi_ref) - 1: where that is
+    negative for all altitudes that theta and scale allow, the row falls in theta and in the scale, which bounds it far more closely.
+    Both bounds hold; the closer one is returned.
     """
-    near, far = end_z_m + sets.z[:, 0], end_z_m + sets.z[:, 1]
-    low = row_of_point(camera, sets.theta[:, 1], sets.y[:, 0], far)
-    high = row_of_point(camera, sets.theta[:, 0], sets.y[:, 1], near)
-    slope = np.minimum(np.maximum(sets.y[:, 1], altitude_range(camera, sets)[1]) / near, 1.0)
+    end = np.asarray(end_z_m, dtype=np.float64)
+
+    def beside(values: Floats) -> Floats:
+        return values.reshape(-1, *[1] * end.ndim)
+
+    near, far = beside(sets.z[:, 0]) + end, beside(sets.z[:, 1]) + end
+    y_flat, y_steep = (camera.focal_px * sets.reference_fall[:, side] / sets.scale[:, side] for side in (0, 1))
+    slope = np.minimum(beside(np.maximum(sets.y[:, 1], altitude_range(camera, sets)[1])) / near, 1.0)
     # sin(beta) cos(beta) = slope / (1 + slope^2), which rises up to slope 1
-    cotangent = reach(sets.theta[:, 0], sets.tangent) / fall(sets.theta[:, 0], sets.tangent)
-    falls = slope / (1 + slope**2) * np.maximum(cotangent, 0) < 1
-    y_steep, y_flat = (camera.focal_px * fall(sets.theta[:, side], sets.tangent) / sets.scale[:, side] for side in (1, 0))
-    low_on_scale = row_of_point(camera, sets.theta[:, 1], y_steep, far)
-    high_on_scale = row_of_point(camera, sets.theta[:, 0], y_flat, near)
-    return np.where(falls, np.maximum(low, low_on_scale), low), np.where(falls, np.minimum(high, high_on_scale), high)
+    cotangent = (sets.turn[0][:, 0] - sets.turn[1][:, 0] * sets.tangent) / sets.reference_fall[:, 0]
+    falls = slope * np.maximum(beside(cotangent), 0) < 1 + slope**2
+    # The row rises in y: where both bounds hold, the closer one is that of the larger or smaller of the two altitudes.
+    y_low = np.where(falls, np.maximum(beside(sets.y[:, 0]), beside(y_steep)), beside(sets.y[:, 0]))
+    y_high = np.where(falls, np.minimum(beside(sets.y[:, 1]), beside(y_flat)), beside(sets.y[:, 1]))
+    low = _row(camera, sets, 1, y_low, far, beside)
+    return low, _row(camera, sets, 0, y_high, near, beside)
+
+
+def _row(camera: Camera, sets: StateSet, side: int, y: Floats, d: Floats, beside: Callable[[Floats], Floats]) -> Floats:
+    """`row_of_point` at the lower (0) or upper (1) theta of each set."""
+    cosine, sine = beside(sets.turn[0][:, side]), beside(sets.turn[1][:, side])
+    return camera.v0 + camera.focal_px * (y * cosine - d * sine) / (y * sine + d * cosine)
 
 
 def scale_ratio(sets: StateSet, tangent: Floats) -> tuple[Floats, Floats]:
     """Range of R = s(theta, t) / s(theta, t_ref) over each set; `tangent` (sets, rows). Below the horizon R > 0: bounds stop at 0."""
-    first, second = (fall(theta[:, None], tangent) / fall(theta, sets.tangent)[:, None] for theta in sets.theta.T)
+    (cosine, sine), reference = sets.turn, sets.reference_fall
+    first = tangent * (cosine[:, :1] / reference[:, :1]) + sine[:, :1] / reference[:, :1]
+    second = tangent * (cosine[:, 1:] / reference[:, 1:]) + sine[:, 1:] / reference[:, 1:]
     return np.maximum(np.minimum(first, second), 0), np.maximum(np.maximum(first, second), 0)
 
 

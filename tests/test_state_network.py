@@ -21,6 +21,7 @@ from torch.nn import functional
 from build_model.export import build_banks, filter_function
 from build_model.filter_graph import OPSET, filter_graph
 from build_model.filter_network import assemble
+from build_model.pixel_mask import Window
 from build_model.spatial_filter import spatial_filters
 from build_model.state_network import (
     BLOCK_ROWS,
@@ -30,6 +31,7 @@ from build_model.state_network import (
     StateNetwork,
     TrainingReport,
     domain_window,
+    in_whole_blocks,
     learning_rate_share,
     miss_pixels,
     state_graph,
@@ -129,6 +131,13 @@ def test_missing_pixels_darkens_as_many_lit_ones_as_asked() -> None:
     assert (after <= before).all()
     np.testing.assert_array_equal((before - after).sum(axis=(1, 2)), np.minimum(missed, before.sum(axis=(1, 2))))
     assert (after != again).any()
+
+
+@pytest.mark.parametrize(
+    ("top", "bottom", "expected"), [(5, 18, (5, 21)), (8, 23, (7, 23)), (0, 23, (0, 23)), (5, 13, (5, 13)), (4, 22, (3, 23))]
+)
+def test_a_window_grows_to_whole_blocks_inside_the_frame(top: int, bottom: int, expected: tuple[int, int]) -> None:
+    assert in_whole_blocks(Window(top, bottom, 2, 9), height=23) == Window(*expected, 2, 9)
 
 
 def test_the_window_holds_every_spatial_filter_and_no_more() -> None:
@@ -347,7 +356,7 @@ def test_the_exported_graph_is_static_and_crops_first(trained: tuple[StateNetwor
     onnx.checker.check_model(model, full_check=True)
     assert model.graph.node[0].op_type == "Slice"
     operators = [node.op_type for node in model.graph.node]
-    assert set(operators) <= {"Slice", "Cast", "Squeeze", "Pad", "Reshape", "MatMul", "Add", "Mul", "Relu", "Transpose", "Conv", "Gemm"}
+    assert set(operators) <= {"Slice", "Cast", "Squeeze", "Split", "Reshape", "MatMul", "Add", "Mul", "Relu", "Transpose", "Conv", "Gemm"}
     assert all(node.domain == "" for node in model.graph.node)
     inferred = onnx.shape_inference.infer_shapes(model).graph
     for value in (*inferred.input, *inferred.output, *inferred.value_info):
