@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from runtime.image import dilated
 from runtime.model_file import ModelError, ModelFile, parse_model
-from runtime.refine import STATE_MARGIN, Refiner, connected_parts
+from runtime.refine import STATE_MARGIN, Refiner, connected_parts, joined
 from runtime.scene import STATE_NAMES, Scene, SceneError
 from runtime.state_set import StateSet, tangent_of_row
 
@@ -28,8 +28,9 @@ PACKAGED_MODELS = (Path(__file__).parent / "models", Path(__file__).parents[1] /
 """Where the paper's model lies: in a wheel beside this file, in a checkout at the top."""
 LOG_ERRORS_ONLY = 3
 OUTPUTS = ("cell", "support", "mismatch", "passes", "cell_lower", "cell_upper", "filtered", "network_state")
-ENTRY_TENSORS = ("state_lower", "state_upper", "line_lower", "line_upper", "reference_row")
-"""Initialisers that hold every entry as a box of states and of line coordinates."""
+BOX_TENSORS = ("state_lower", "state_upper", "line_lower", "line_upper", "reference_row")
+MASK_TENSORS = ("spatial_start", "spatial_stop", "window_first", "window_stop")
+"""Initialisers that hold every entry as a box of states and of line coordinates, and every cell's spatial mask."""
 
 
 class FrameError(ValueError):
@@ -126,7 +127,7 @@ class Estimator:
         self._domain_lower, self._domain_upper = self.scene.domain.lower, self.scene.domain.upper
         self._fixed = self._domain_lower == self._domain_upper
         self._entries = _Entries.of(self.scene, model.tensors)
-        self._refiner = Refiner(self.scene, int(self._budgets["missed_budget"]))
+        self._refiner = Refiner(self.scene, int(self._budgets["missed_budget"]), int(self._budgets["extra_budget"]))
 
     @classmethod
     def load(
@@ -148,7 +149,7 @@ class Estimator:
             content = source.read_bytes()
         except OSError as error:
             raise ModelError(f"{source}: cannot be read ({error.strerror}); give the path of a model that export-model wrote") from error
-        model = parse_model(content, str(source), ENTRY_TENSORS)
+        model = parse_model(content, str(source), BOX_TENSORS + MASK_TENSORS)
         if sha256 is not None and sha256.lower() != model.sha256:
             raise ModelError(f"{source}: sha256 is {model.sha256}, the caller trusts {sha256}; take the file from its source again")
         return cls(model, str(source), threads, missed_budget, extra_budget)
@@ -166,7 +167,7 @@ class Estimator:
         network = np.where(self._fixed, self._domain_lower, network_state)
         passing = np.flatnonzero(support)
         if refine and len(passing):
-            regions = self._regions(self._refiner.refine(self._witnesses(pixels), self._entries.sets(passes)))
+            regions = self._regions(self._refined(pixels.view(np.bool_), passes))
         else:
             regions = self._hulls(cell_lower[passing], cell_upper[passing], [np.arange(len(passing))] if len(passing) else [])
         box = Box(np.min([part.lower for part in regions], axis=0), np.max([part.upper for part in regions], axis=0)) if regions else None
@@ -185,12 +186,19 @@ class Estimator:
             touches_boundary=box is not None and self._touches_boundary(box),
         )
 
-    def _witnesses(self, pixels: NDArray[np.uint8]) -> NDArray[np.bool_]:
-        """Lit where a lit pixel lies within `line_px` in the sup norm, or the frame ends: the camera may see that point outside of it."""
-        radius = self.scene.tolerance.line_px
-        height, width = pixels.shape
-        wide = dilated(np.pad(pixels.view(np.bool_), radius, constant_values=True), radius)
-        return wide[radius : radius + height, radius : radius + width]
+    def _refined(self, frame: NDArray[np.bool_], passes: NDArray[np.bool_]) -> StateSet:
+        """What is left of the passing entries. Theorem B's claims, which differ from cell to cell, are made at tolerance 0 only."""
+        witnesses = dilated(frame, self.scene.tolerance.line_px)
+        if self._refiner.extra_budget < 0 or self.scene.tolerance.line_px > 0:
+            return self._refiner.refine(witnesses, self._entries.sets(passes))
+        cells = np.flatnonzero(passes.any(axis=1))
+        alone = np.arange(len(passes))[:, None]
+        return joined(
+            *(
+                self._refiner.refine(witnesses, self._entries.sets(passes & (alone == cell)), self._entries.within(cell, frame))
+                for cell in cells
+            )
+        )
 
     def _regions(self, pieces: StateSet) -> tuple[Box, ...]:
         """Boxes of the connected parts of the pieces."""
@@ -264,9 +272,13 @@ class Estimator:
 
 @dataclass(frozen=True)
 class _Entries:
-    """Every bank entry of the model as a set of states, padding included, which never passes."""
+    """Every bank entry of the model as a set of states, padding included, which never passes; and the cells' spatial masks."""
 
     all: StateSet
+    spatial_start: NDArray[np.int32]
+    spatial_stop: NDArray[np.int32]
+    """Runs of S as flat indices into (rows + 1, columns) of the window, (runs, cells)."""
+    window: tuple[slice, slice]
 
     @staticmethod
     def of(scene: Scene, tensors: dict[str, NDArray[Any]]) -> _Entries:
@@ -276,11 +288,25 @@ class _Entries:
         for axis, (low, high) in enumerate(zip(scene.domain.lower, scene.domain.upper, strict=True)):
             states[axis] = np.clip(states[axis], low, high)
         theta, x, y, z = states
-        return _Entries(StateSet(theta, x, y, z, scale, tangent_of_row(scene.camera, tensors["reference_row"].ravel())))
+        sets = StateSet(theta, x, y, z, scale, tangent_of_row(scene.camera, tensors["reference_row"].ravel()))
+        window = tuple(slice(int(first), int(stop)) for first, stop in zip(tensors["window_first"], tensors["window_stop"], strict=True))
+        runs = (tensors[f"spatial_{side}"].reshape(-1, scene.domain.cell_count) for side in ("start", "stop"))
+        return _Entries(sets, *runs, (window[0], window[1]))
 
     def sets(self, passes: NDArray[np.bool_]) -> StateSet:
         """The entries that pass; `passes` is (cells, entries)."""
         return self.all[np.flatnonzero(passes)]
+
+    def within(self, cell: int, frame: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """The frame within the cell's spatial mask S."""
+        seen = np.zeros_like(frame)
+        crop = frame[self.window]
+        steps = np.zeros((crop.shape[0] + 1) * crop.shape[1], dtype=np.int8)
+        np.add.at(steps, self.spatial_start[:, cell], 1)
+        np.add.at(steps, self.spatial_stop[:, cell], -1)
+        mask = steps.reshape(-1, crop.shape[1]).cumsum(axis=0, dtype=np.int8)[:-1] > 0
+        seen[self.window] = crop & mask
+        return seen
 
 
 def _packaged_model() -> Path:

@@ -6,17 +6,31 @@
 | `.es`, `.aedat4` | faery | in the file |
 | `.csv`: a header that names t, x, y, p or none, then whole numbers | numpy | none, or a header `t,x@640,y@480,p` |
 | `.npz`: arrays t, x, y, p | numpy | none |
+| `.h5`, `.hdf5`: columns t, x, y, p at the top or in a group `events` | h5py | attributes `width` and `height` there, or none |
 
-Times are in us, x is the column and y the row from the top left. faery comes with the extra `recordings`, is imported only
-when one of its formats is read, and raises a time that runs backwards to the latest one before it; numpy's formats keep such
-times, so that `runtime.frames` can count them.
+Times are in us, x is the column and y the row from the top left. faery and h5py come with the extra `recordings` and are imported
+only when one of their formats is read. Every kind is read in constant memory.
+
+No event is lost without a word. What was good before a fault is given before the fault is raised:
+
+- A RAW or DAT file that ends inside an event is an error at its end. One cut between two events cannot be told from a shorter
+  recording; of an ES file that is cut, the last event goes without a word, as the format does not say how many there are.
+- faery refuses a RAW or DAT file at the first event outside the geometry in its header. Such a file is read again without the
+  geometry, and `runtime.frames` counts the events outside the sensor.
+- faery raises a time that runs backwards to the latest one before it; the other formats keep such times, and `runtime.frames`
+  counts them.
 """
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import math
 import re
-from collections.abc import Iterator
+import shutil
+import tempfile
+import zipfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +41,16 @@ EVENT = np.dtype([("t", np.int64), ("x", np.int32), ("y", np.int32), ("p", np.in
 """What a packet holds: time (us), column, row, polarity."""
 
 PACKET_EVENTS = 65_536
-"""Events in a packet of a CSV or npz file; faery's packets have their own length."""
+"""Events in a packet of a CSV, npz or HDF5 file; faery's packets have their own length."""
 
 FAERY_SUFFIXES = (".raw", ".dat", ".es", ".aedat4")
+HDF5_SUFFIXES = (".h5", ".hdf5")
+HDF5_GROUPS = ("", "events", "CD/events")
+"""Where an HDF5 file may hold the columns: at the top, as DSEC does, or as Prophesee does."""
+EVENT_BYTES = {"evt2": 4, "evt3": 2, "dat": 8}
+"""Size of a word: a file ends with a whole one."""
+BINARY_DAT_HEADER_BYTES = 2
+"""A DAT file's header is followed by the type and the size of its events."""
 COLUMN_NAMES = {"t": "t", "x": "x", "y": "y", "p": "p", "on": "p", "polarity": "p"}
 EVT_VERSIONS = {"2.0": "evt2", "EVT2": "evt2", "3.0": "evt3", "EVT3": "evt3"}
 LONGEST_HEADER_BYTES = 65_536
@@ -57,6 +78,8 @@ def read_events(path: str | Path, shape: tuple[int, int] | None = None) -> Itera
         return _npz_packets(path)
     if path.suffix == ".csv":
         return _csv_packets(path)
+    if path.suffix in HDF5_SUFFIXES:
+        return _hdf5_packets(path)
     return _faery_packets(path, declared or shape)
 
 
@@ -65,8 +88,10 @@ def sensor_shape(path: str | Path) -> tuple[int, int] | None:
     path = Path(path)
     if not path.is_file():
         raise RecordingError(f"{path}: no such file; give the path of a recording")
+    if path.stat().st_size == 0:
+        raise RecordingError(f"{path}: the file is empty; record or copy it again")
     if path.suffix in (".raw", ".dat"):
-        return _header_shape(_header(path))
+        return _header_shape(_header(path)[0])
     if path.suffix in FAERY_SUFFIXES:
         width, height = _decoder(path).dimensions()
         return height, width
@@ -74,20 +99,28 @@ def sensor_shape(path: str | Path) -> tuple[int, int] | None:
         return _csv_columns(path)[1]
     if path.suffix == ".npz":
         return None
-    raise RecordingError(f"{path}: unknown kind {path.suffix!r}; known are {', '.join((*FAERY_SUFFIXES, '.csv', '.npz'))}")
+    if path.suffix in HDF5_SUFFIXES:
+        with _hdf5_file(path) as file:
+            holder, _ = _hdf5_columns(path, file)
+            return _shape(*(str(holder.attrs.get(name, "")) for name in ("height", "width")))
+    known = ", ".join((*FAERY_SUFFIXES, ".csv", ".npz", *HDF5_SUFFIXES))
+    raise RecordingError(f"{path}: unknown kind {path.suffix!r}; known are {known}")
 
 
-def _header(path: Path) -> dict[str, str]:
-    """The lines `% keyword value` at the start of a RAW or DAT file, keywords in lower case."""
+def _header(path: Path) -> tuple[dict[str, str], int]:
+    """The lines `% keyword value` at the start of a RAW or DAT file, keywords in lower case, and how many bytes they take."""
     with path.open("rb") as file:
         start = file.read(LONGEST_HEADER_BYTES)
-    header = {}
+    header, size = {}, 0
     for line in start.decode("latin-1").split("\n"):
         keyword, _, value = line.removeprefix("%").strip().partition(" ")
-        if not line.startswith("%") or keyword == "end":
+        if not line.startswith("%"):
+            break
+        size += len(line) + 1
+        if keyword == "end":
             break
         header[keyword.lower()] = value.strip()
-    return header
+    return header, size
 
 
 def _header_shape(header: dict[str, str]) -> tuple[int, int] | None:
@@ -105,14 +138,59 @@ def _shape(height: str, width: str) -> tuple[int, int] | None:
 def _faery_packets(path: Path, shape: tuple[int, int] | None) -> Iterator[NDArray[Any]]:
     if shape is None:
         raise RecordingError(f"{path}: the header tells no sensor size; give the (height, width)")
-    version = None
-    if path.suffix == ".raw":
-        header = _header(path)
-        name = header.get("evt") or header.get("format", "").split(";")[0]
-        version = EVT_VERSIONS.get(name)
-        if version is None:
-            raise RecordingError(f"{path}: found {f'format {name}' if name else 'no format'} in the header; convert it to EVT2 or EVT3")
-    return _converted(path, _decoder(path, dimensions_fallback=(shape[1], shape[0]), version_fallback=version))
+    if path.suffix not in (".raw", ".dat"):
+        return _converted(path, _decoder(path))
+    version = _raw_version(path) if path.suffix == ".raw" else None
+    stream = _decoder(path, dimensions_fallback=(shape[1], shape[0]), version_fallback=version)
+    return _checked_to_the_end(path, version, _with_events_outside(path, version, stream))
+
+
+def _raw_version(path: Path) -> str:
+    """ "evt2" or "evt3". Raises `RecordingError` for any other RAW file."""
+    header, _ = _header(path)
+    name = header.get("evt") or header.get("format", "").split(";")[0]
+    if name not in EVT_VERSIONS:
+        raise RecordingError(f"{path}: found {f'format {name}' if name else 'no format'} in the header; convert it to EVT2 or EVT3")
+    return EVT_VERSIONS[name]
+
+
+def _with_events_outside(path: Path, version: str | None, stream: Any) -> Iterator[NDArray[Any]]:
+    """The stream's packets; where faery stops at an event outside the header's geometry, the rest as read without the geometry."""
+    given = 0
+    try:
+        for packet in _converted(path, stream):
+            yield packet
+            given += len(packet)
+        return
+    except RecordingError as error:
+        if "overflow" not in str(error):
+            raise
+    with tempfile.TemporaryDirectory(prefix="glideproof-") as folder:
+        bare = _without_geometry(path, Path(folder))
+        largest = 2**16 - 1
+        for packet in _converted(path, _decoder(bare, dimensions_fallback=(largest, largest), version_fallback=version)):
+            yield packet[given:]
+            given = max(given - len(packet), 0)
+
+
+def _without_geometry(path: Path, folder: Path) -> Path:
+    """A copy of a RAW or DAT file in `folder` whose header tells no sensor size."""
+    bare = folder / path.name
+    _, size = _header(path)
+    with path.open("rb") as source, bare.open("wb") as copy:
+        for line in source.read(size).splitlines(keepends=True):
+            if not re.search(rb"geometry|height|width", line, re.IGNORECASE):
+                copy.write(line)
+        shutil.copyfileobj(source, copy)
+    return bare
+
+
+def _checked_to_the_end(path: Path, version: str | None, packets: Iterator[NDArray[Any]]) -> Iterator[NDArray[Any]]:
+    """The packets, then an error if the file ends inside a word, which faery drops without saying so."""
+    yield from packets
+    size = path.stat().st_size - _header(path)[1] - (0 if version else BINARY_DAT_HEADER_BYTES)
+    if left := size % EVENT_BYTES[version or "dat"]:
+        raise RecordingError(f"{path}: the file ends inside an event ({left} bytes of it); it was cut short, all events before it are kept")
 
 
 def _decoder(path: Path, **options: Any) -> Any:
@@ -132,7 +210,8 @@ def _converted(path: Path, packets: Any) -> Iterator[NDArray[Any]]:
         for packet in packets:
             yield _packet(packet["t"], packet["x"], packet["y"], packet["p"])
     except RuntimeError as error:
-        raise RecordingError(f"{path}: {error}") from error
+        reason = " ".join(str(error).split())
+        raise RecordingError(f"{path}: damaged here: {reason}; all events before it are kept") from error
 
 
 def _packet(t: NDArray[Any], x: NDArray[Any], y: NDArray[Any], p: NDArray[Any]) -> NDArray[Any]:
@@ -142,24 +221,123 @@ def _packet(t: NDArray[Any], x: NDArray[Any], y: NDArray[Any], p: NDArray[Any]) 
 
 
 def _npz_packets(path: Path) -> Iterator[NDArray[Any]]:
+    """Reads the four arrays side by side, a packet at a time, without unpacking the whole of one."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            columns = {name: archive[name] for name in "txyp" if name in archive}
-    except Exception as error:  # a damaged archive fails in zipfile, zlib or numpy
+        with zipfile.ZipFile(path) as archive:
+            names = archive.namelist()
+            missing = [name for name in "txyp" if f"{name}.npy" not in names]
+            lengths, dtypes = {}, {}
+            for name in (name for name in "txyp" if name not in missing):
+                with archive.open(f"{name}.npy") as file:
+                    shape, _, dtypes[name] = _npy_header(file)
+                lengths[name] = _column_length(path, name, dtypes[name], shape)
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError, NotImplementedError) as error:
+        if isinstance(error, RecordingError):
+            raise
         raise RecordingError(f"{path}: cannot be read ({error}); give an npz file with arrays t, x, y, p") from error
-    if missing := set("txyp") - set(columns):
-        raise RecordingError(f"{path}: no array {', '.join(sorted(missing))}; the arrays t, x, y, p are needed")
-    for name, column in columns.items():
-        if column.ndim != 1 or column.dtype.kind not in ("iub" if name == "p" else "iu"):
-            raise RecordingError(f"{path}: {name} is {column.dtype} of shape {column.shape}; give one column of whole numbers (t in us)")
-        limits = np.iinfo(EVENT[name])
-        if len(column) and not (limits.min <= int(column.min()) and int(column.max()) <= limits.max):
-            raise RecordingError(f"{path}: {name} runs from {column.min()} to {column.max()}, beyond {EVENT[name]}; is it damaged?")
-    lengths = {name: len(column) for name, column in columns.items()}
+    if missing:
+        raise RecordingError(f"{path}: no array {', '.join(missing)}; the arrays t, x, y, p are needed")
+    _check_lengths(path, lengths)
+    return _npz_read(path, lengths["t"], dtypes)
+
+
+def _npy_header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape, Fortran order and dtype of an npy file, which is read to the start of its numbers."""
+    read = {1: np.lib.format.read_array_header_1_0, 2: np.lib.format.read_array_header_2_0}
+    major, _ = np.lib.format.read_magic(file)
+    if major not in read:
+        raise ValueError(f"npy format {major}")
+    return read[major](file)
+
+
+def _npz_read(path: Path, length: int, dtypes: dict[str, np.dtype[Any]]) -> Iterator[NDArray[Any]]:
+    with contextlib.ExitStack() as stack:
+        archive = stack.enter_context(zipfile.ZipFile(path))
+        files = {name: stack.enter_context(archive.open(f"{name}.npy")) for name in dtypes}
+        for file in files.values():
+            _npy_header(file)
+
+        def part(name: str, start: int, stop: int) -> NDArray[Any]:
+            wanted = (stop - start) * dtypes[name].itemsize
+            numbers = files[name].read(wanted)
+            if len(numbers) < wanted:
+                raise EOFError(f"{name} ends early")
+            return np.frombuffer(numbers, dtype=dtypes[name])
+
+        yield from _column_packets(path, length, part)
+
+
+def _hdf5_file(path: Path) -> Any:
+    """The open HDF5 file. Raises `RecordingError`."""
+    try:
+        import h5py
+    except ModuleNotFoundError as error:
+        raise RecordingError(f"{path}: {path.suffix} needs h5py, which is not installed: pip install glideproof[recordings]") from error
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read ({error}); give an HDF5 file with columns t, x, y, p") from error
+
+
+def _hdf5_columns(path: Path, file: Any) -> tuple[Any, dict[str, Any]]:
+    """The group, table or file that holds the columns, and the columns t, x, y, p. Raises `RecordingError`."""
+    for place in HDF5_GROUPS:
+        holder = file if place == "" else file.get(place)
+        if hasattr(holder, "dtype") and holder.dtype.names:
+            names, column = holder.dtype.names, holder.fields
+        elif hasattr(holder, "keys"):
+            names, column = tuple(holder), holder.get
+        else:
+            continue
+        if set("txyp") <= set(names):
+            return holder, {name: column(name) for name in "txyp"}
+    raise RecordingError(f"{path}: no columns t, x, y, p at the top or in a group 'events'; found {', '.join(file) or 'nothing'}")
+
+
+def _hdf5_packets(path: Path) -> Iterator[NDArray[Any]]:
+    with _hdf5_file(path) as file:
+        holder, columns = _hdf5_columns(path, file)
+        if hasattr(holder, "dtype"):
+            lengths = {name: _column_length(path, name, holder.dtype[name], holder.shape) for name in columns}
+        else:
+            lengths = {name: _column_length(path, name, column.dtype, column.shape) for name, column in columns.items()}
+    _check_lengths(path, lengths)
+    return _hdf5_read(path, lengths["t"])
+
+
+def _hdf5_read(path: Path, length: int) -> Iterator[NDArray[Any]]:
+    with _hdf5_file(path) as file:
+        _, columns = _hdf5_columns(path, file)
+        yield from _column_packets(path, length, lambda name, start, stop: columns[name][start:stop])
+
+
+def _column_length(path: Path, name: str, dtype: np.dtype[Any], shape: tuple[int, ...]) -> int:
+    """Length of a column. Raises `RecordingError` unless it is one of whole numbers."""
+    if len(shape) != 1 or dtype.kind not in ("iub" if name == "p" else "iu"):
+        raise RecordingError(f"{path}: {name} is {dtype} of shape {shape}; give one column of whole numbers (t in us)")
+    return math.prod(shape)
+
+
+def _check_lengths(path: Path, lengths: dict[str, int]) -> None:
     if len(set(lengths.values())) > 1:
         raise RecordingError(f"{path}: arrays of different lengths {lengths}; give one value an event")
-    starts = range(0, lengths["t"], PACKET_EVENTS)
-    return (_packet(*(columns[name][start : start + PACKET_EVENTS] for name in "txyp")) for start in starts)
+
+
+def _column_packets(path: Path, length: int, part: Callable[[str, int, int], NDArray[Any]]) -> Iterator[NDArray[Any]]:
+    """Packets of four columns; `part(name, start, stop)` reads a piece of one. Raises `RecordingError` where a piece is damaged."""
+    for start in range(0, length, PACKET_EVENTS):
+        stop = min(start + PACKET_EVENTS, length)
+        try:
+            columns = {name: part(name, start, stop) for name in "txyp"}
+        except Exception as error:  # a damaged file fails in zipfile, zlib or HDF5, with classes of their own
+            reason = " ".join(str(error).split())
+            raise RecordingError(f"{path}: events {start} to {stop}: {reason}; damaged, all events before them are kept") from error
+        for name, column in columns.items():
+            limits = np.iinfo(EVENT[name])
+            if not (limits.min <= int(column.min()) and int(column.max()) <= limits.max):
+                found = f"{name} runs from {column.min()} to {column.max()}, beyond {EVENT[name]}"
+                raise RecordingError(f"{path}: events {start} to {stop}: {found}; is it damaged?")
+        yield _packet(*columns.values())
 
 
 def _csv_columns(path: Path) -> tuple[tuple[int, ...], tuple[int, int] | None, bool]:
@@ -182,11 +360,32 @@ def _csv_packets(path: Path) -> Iterator[NDArray[Any]]:
         if has_header:
             next(lines)
         while chunk := list(itertools.islice(lines, PACKET_EVENTS)):
-            first, last = chunk[0][0], chunk[-1][0]
-            filled = [line for _, line in chunk if line.strip()]
-            if not filled:
-                continue
+            filled = [(number, line) for number, line in chunk if line.strip()]
             try:
-                yield np.loadtxt(filled, dtype=EVENT, delimiter=",", usecols=columns, comments=None, ndmin=1)
-            except ValueError as error:
-                raise RecordingError(f"{path}: lines {first} to {last}: {error}; give whole numbers t (us), x, y, p") from error
+                packet = _csv_parsed([line for _, line in filled], columns)
+            except ValueError:
+                good = _good_lines(filled, columns)
+                yield _csv_parsed([line for _, line in filled[:good]], columns)
+                number, line = filled[good]
+                found = f"found {line.strip():.60}"
+                raise RecordingError(f"{path}: line {number}: {found}; give whole numbers t (us), x, y, p") from None
+            yield packet
+
+
+def _csv_parsed(lines: list[str], columns: tuple[int, ...]) -> NDArray[Any]:
+    if not lines:
+        return np.empty(0, dtype=EVENT)
+    return np.loadtxt(lines, dtype=EVENT, delimiter=",", usecols=columns, comments=None, ndmin=1)
+
+
+def _good_lines(lines: list[tuple[int, str]], columns: tuple[int, ...]) -> int:
+    """How many lines stand before the first faulty one: the largest part of the lines that can be parsed, found by halving."""
+    good, faulty = 0, len(lines)
+    while faulty - good > 1:
+        middle = (good + faulty) // 2
+        try:
+            _csv_parsed([line for _, line in lines[:middle]], columns)
+            good = middle
+        except ValueError:
+            faulty = middle
+    return good

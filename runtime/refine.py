@@ -9,12 +9,16 @@ up to the missed pixels. In a thin slice R is all but a number, and every border
 sides. Beyond the rows that all states of the slice cross, the first row without a usable lit pixel ends a marking, and so bounds its
 distance. Slices that contradict the frame are dropped; the others are cut finer, in the end only those that carry a face of the box.
 
+Under Theorem B the lit pixels of S (here: claimed pixels) are the runway's, but for `extra_budget` of them. A claimed pixel that only one
+marking of the slice could light bounds that marking's offset by the pixel's other side, and pulls its ends out to the pixel's row.
+
 Guarantee: each state of the given entries that is consistent with the frame stays in some slice. Pixels outside the frame count as
 lit. A dark pixel of the runway spoils at most the two borders of its row and one row of an end, for each marking that shares it.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,26 +47,31 @@ NO_ROW = 2**20
 
 @dataclass(frozen=True)
 class Refiner:
-    """Refines the entries of one model. `missed_budget` is m; `frame` arguments are the frame dilated by the tolerance."""
+    """Refines the entries of one model. `missed_budget` is m, `extra_budget` is e."""
 
     scene: Scene
     missed_budget: int
+    extra_budget: int
 
-    def refine(self, frame: Bits, entries: StateSet) -> StateSet:
-        """Slices that hold all states of `entries` which are consistent with `frame`, (height, width); none if there is none."""
+    def refine(self, frame: Bits, entries: StateSet, claimed: Bits | None = None) -> StateSet:
+        """Slices that hold all states of `entries` which are consistent with `frame`, (height, width); none if there is none.
+
+        `frame` is dilated by the tolerance. `claimed`: the lit pixels of S, for Theorem B at tolerance 0; the entries are of one cell then.
+        """
         if len(entries) > LARGEST_START:
             return entries
         canvas = np.pad(frame, 1, constant_values=True)
+        claims = None if claimed is None else np.pad(claimed, 1)
         pieces = entries
         for cuts in CUTS:
-            pieces = self._contracted(canvas, _cut(pieces, theta=cuts))
+            pieces = self._contracted(canvas, claims, _cut(pieces, theta=cuts))
         for _ in range(FACE_ROUNDS):
             outer = _carries_a_face(pieces, FACE_PIECES)
-            finer = self._contracted(canvas, _cut(pieces[outer], theta=FACE_CUTS[0], z=FACE_CUTS[1]))
-            pieces = _joined(finer, pieces[~outer])
+            finer = self._contracted(canvas, claims, _cut(pieces[outer], theta=FACE_CUTS[0], z=FACE_CUTS[1]))
+            pieces = joined(finer, pieces[~outer])
         return pieces
 
-    def _contracted(self, canvas: Bits, sets: StateSet) -> StateSet:
+    def _contracted(self, canvas: Bits, claims: Bits | None, sets: StateSet) -> StateSet:
         """The sets, whose arrays are overwritten, without most of the states that the frame contradicts, and without empty sets."""
         if len(sets) == 0:
             return sets
@@ -70,6 +79,8 @@ class Refiner:
         grid = _Grid.of(self.scene, sets)
         lit = _lit_columns(self.scene, canvas, sets, grid)
         offset = self._offsets(grid, lit)
+        if claims is not None:
+            offset = self._by_claims(sets, grid, _lit_columns(self.scene, claims, sets, grid), int(claims.sum()), offset)
         self._by_offset(sets, offset)
         self._by_ends(sets, grid, lit)
         self._by_altitude(sets)
@@ -126,6 +137,38 @@ class Refiner:
         ends_z, markings = self.scene.runway.ends_z_m, last.shape[1]
         _draw_in(sets.z, (distance_low[:, :markings] - ends_z[:, 0]).max(axis=1), (distance_high[:, markings:] - ends_z[:, 1]).min(axis=1))
 
+    def _by_claims(
+        self, sets: StateSet, grid: _Grid, claimed: _LitColumns, in_all: int, offset: tuple[Floats, Floats]
+    ) -> tuple[Floats, Floats]:
+        """Draws z in, and returns the offset's bounds drawn in, by claimed pixels; `in_all` is their number in the frame."""
+        claimed = claimed.of_one_marking()
+        row, spoiled = grid.rows[:, None, :-1], self.extra_budget
+        found = claimed.last >= claimed.first
+        whole = np.zeros_like(found)
+        whole[..., 1:-1] = grid.crossed[..., :-1] & grid.crossed[..., 1:] & found[..., 1:-1]
+        rises = (self.scene.runway.x_m[:, None] >= sets.x[:, None, ::-1]).all(axis=-1)[..., None]
+        falls = (self.scene.runway.x_m[:, None] <= sets.x[:, None, ::-1]).all(axis=-1)[..., None]
+        ratios = [ratio[:, None, :] for ratio in grid.ratio]
+        high = claimed.first + 1 - self.scene.camera.u0 + OUTWARD_PX
+        low = claimed.last - self.scene.camera.u0 - OUTWARD_PX
+        start = [1 / np.maximum(ratio[..., :-1], 1 / NO_BOUND) for ratio in ratios]
+        stop = [1 / np.maximum(ratio[..., 1:], 1 / NO_BOUND) for ratio in ratios]
+        high = np.where(rises, np.maximum(high * start[0], high * start[1]), np.maximum(high * stop[0], high * stop[1]))
+        low = np.where(rises, np.minimum(low * stop[0], low * stop[1]), np.minimum(low * start[0], low * start[1]))
+        usable = whole & (rises | falls)
+        offset_high = -_largest_but(np.where(usable, -high, -NO_BOUND), spoiled)
+        offset_low = _largest_but(np.where(usable, low, -NO_BOUND), spoiled)
+        last = _largest_but(np.where(found, row, -NO_ROW).astype(np.float64), spoiled)
+        first = -_largest_but(np.where(found, -row - 1, -NO_ROW).astype(np.float64), spoiled)
+        reach_low, reach_high = below(grid.far[0]), above(grid.near[1])
+        near, far = np.clip(last, reach_low, reach_high), np.clip(first, reach_low, reach_high)
+        distance_low, distance_high = self._distances(sets, np.concatenate([near, far], axis=1))
+        ends_z, markings = self.scene.runway.ends_z_m, last.shape[1]
+        _draw_in(sets.z, (distance_low[:, markings:] - ends_z[:, 1]).max(axis=1), (distance_high[:, :markings] - ends_z[:, 0]).min(axis=1))
+        unexplained = in_all - claimed.count.sum(axis=(1, 2)) > self.extra_budget
+        offset_low[unexplained] = NO_BOUND
+        return np.maximum(offset[0], offset_low), np.minimum(offset[1], offset_high)
+
     def _distances(self, sets: StateSet, row: Floats) -> tuple[Floats, Floats]:
         """Range of the distance d = F (cos(theta) - t sin(theta)) / (scale R) of the ground at rows (sets, rows)."""
         tangent = tangent_of_row(self.scene.camera, row)
@@ -176,10 +219,23 @@ def _ends(scene: Scene, sets: StateSet) -> tuple[tuple[Floats, Floats], tuple[Fl
 
 @dataclass(frozen=True)
 class _LitColumns:
-    """First and last lit column among those a marking could light in a row, (sets, markings, rows); last < first where none is."""
+    """First and last lit column among those a marking could light in a row, (sets, markings, rows); last < first where none is.
+
+    `window` bounds the columns that could be lit at all, `count` is how many of them are.
+    """
 
     first: Floats
     last: Floats
+    window: tuple[Rows, Rows]
+    count: Rows
+
+    def of_one_marking(self) -> _LitColumns:
+        """The same without the rows in which another marking could light one of a marking's columns."""
+        low, high = self.window
+        shared = np.zeros(low.shape, dtype=bool)
+        for left, right in itertools.permutations(range(low.shape[1]), 2):
+            shared[:, left] |= (low[:, left] <= high[:, right]) & (low[:, right] <= high[:, left])
+        return replace(self, first=np.where(shared, NO_BOUND, self.first), last=np.where(shared, -NO_BOUND, self.last))
 
 
 def _lit_columns(scene: Scene, canvas: Bits, sets: StateSet, grid: _Grid) -> _LitColumns:
@@ -193,12 +249,14 @@ def _lit_columns(scene: Scene, canvas: Bits, sets: StateSet, grid: _Grid) -> _Li
     row_start = (np.clip(grid.rows[:, None, :-1], -1, height) + 1) * (width + 2) + 1
     pixels = canvas.ravel()
     lowest, highest = np.full(first.shape, NO_BOUND), np.full(first.shape, -NO_BOUND)
+    count = np.zeros(first.shape, dtype=np.int64)
     for step in range(int((last - first).max()) + 1):
         column = first + step
         lit = pixels.take(row_start + np.clip(column, -1, width)) & (column <= last)
         np.minimum(lowest, column, out=lowest, where=lit)
         np.copyto(highest, column, where=lit)
-    return _LitColumns(lowest, highest)
+        count += lit
+    return _LitColumns(lowest, highest, (first, last), count)
 
 
 def _largest_but(values: Floats, count: int) -> Floats:
@@ -240,9 +298,10 @@ def _cut(sets: StateSet, **parts: int) -> StateSet:
     return sets
 
 
-def _joined(first: StateSet, second: StateSet) -> StateSet:
+def joined(*parts: StateSet) -> StateSet:
+    """All sets of the given batches in one."""
     names = ("theta", "x", "y", "z", "scale", "tangent")
-    return StateSet(*(np.concatenate([getattr(first, name), getattr(second, name)]) for name in names))
+    return StateSet(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def _carries_a_face(sets: StateSet, pieces: int) -> Bits:
