@@ -21,14 +21,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from build_model.enclosure import columns_that_may_be_lit, columns_that_must_be_lit
-from build_model.pixel_mask import Runs, Window, clip_and_widen, paint, runs_of
+from build_model.pixel_mask import Bits, Runs, Window, clip_and_widen, paint, runs_of
 from build_model.spatial_filter import reference_row, sliced, spatial_filter
 from runtime.rounding import float32_above, float32_below, inverted
-from runtime.scene import Camera, Scene, SceneError
+from runtime.scene import STATE_NAMES, Camera, Scene, SceneError
 from runtime.state_set import StateSet, contract, scale_range, tangent_of_row
 
 SCALE_STEP = 2.0**-10
 """Bins of the scale have borders on multiples of this, px per metre, so that they do not depend on the machine's libm."""
+LINE_COORDINATES = ("theta", "x", "scale", "z")
+HALVINGS, HALVING_ORDER = 12, ("scale", "x", "theta", "z")
+"""How often an entry that would pass on any frame is halved, along which coordinates by turns, before the scene is refused."""
 SMALLEST_LEVER_M = 1e-3
 """A marking's distance from the camera's vertical plane counts as at least this when the bins of the scale are sized."""
 
@@ -46,6 +49,9 @@ class LineBoxes:
 
     def __len__(self) -> int:
         return len(self.lower)
+
+    def __getitem__(self, chosen: NDArray[np.bool_]) -> LineBoxes:
+        return LineBoxes(self.lower[chosen], self.upper[chosen], self.reference_row[chosen])
 
     def states(self, camera: Camera, cell_lower: NDArray[np.float64], cell_upper: NDArray[np.float64]) -> StateSet:
         """The entries of the cell [cell_lower, cell_upper], (4,) each, as sets of states, not yet contracted."""
@@ -103,40 +109,84 @@ def _scale_bins(scene: Scene, x: NDArray[np.float64], scale: NDArray[np.float64]
     return np.stack([edges[:-1], edges[1:]], axis=-1)
 
 
+@dataclass(frozen=True)
+class _Entries:
+    """Entries with their masks as bits in the cell's window, (entries, rows, columns)."""
+
+    lines: LineBoxes
+    states: StateSet
+    must_light: Bits
+    may_light: Bits
+
+    def __getitem__(self, chosen: NDArray[np.bool_]) -> _Entries:
+        return _Entries(self.lines[chosen], self.states[chosen], self.must_light[chosen], self.may_light[chosen])
+
+    def weak(self, missed_budget: int) -> NDArray[np.bool_]:
+        """True for entries with |K| <= missed_budget, which would pass on any frame."""
+        return self.must_light.sum(axis=(1, 2)) <= missed_budget
+
+    def hopeless(self, missed_budget: int) -> bool:
+        """True if some entry has |O| <= missed_budget: no part of it will ever have a larger |K|."""
+        return bool((self.may_light.sum(axis=(1, 2)) <= missed_budget).any())
+
+
 def cell_bank(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> CellBank:
     """S, entries, O and K of the cell [lower, upper], both (4,).
 
-    Boxes without a state of the cell are dropped, if proved so. Raises `SceneError` where an entry would have |K| <= missed_budget:
-    it would pass on any frame.
+    Boxes without a state of the cell are dropped, if proved so. An entry with |K| <= missed_budget would pass on any frame: it is halved
+    until its parts are stronger. Raises `SceneError` where `HALVINGS` do not get there.
     """
-    lines = line_boxes(scene, lower, upper)
+    spatial, window = spatial_filter(scene, lower, upper)
+    parts = [_entries(scene, line_boxes(scene, lower, upper), lower, upper, spatial, window)]
+    for halving in range(HALVINGS):
+        weak = parts[-1].weak(scene.tolerance.missed_budget)
+        if not weak.any() or parts[-1].hopeless(scene.tolerance.missed_budget):
+            break
+        halves = _halved(parts[-1].lines[weak], HALVING_ORDER[halving % len(HALVING_ORDER)])
+        parts[-1:] = [parts[-1][~weak], _entries(scene, halves, lower, upper, spatial, window)]
+    _demand_strong(scene, parts[-1])
+    state_lower, state_upper = (np.concatenate([getattr(part.states, side) for part in parts]) for side in ("lower", "upper"))
+    return CellBank(
+        lines=LineBoxes(*(np.concatenate([getattr(part.lines, name) for part in parts]) for name in ("lower", "upper", "reference_row"))),
+        spatial=runs_of(spatial[None], window),
+        must_light=runs_of(np.concatenate([part.must_light for part in parts]), window),
+        may_light=runs_of(np.concatenate([part.may_light for part in parts]), window),
+        window=window,
+        state_lower=float32_below(state_lower),
+        state_upper=float32_above(state_upper),
+    )
+
+
+def _entries(
+    scene: Scene, lines: LineBoxes, lower: NDArray[np.float64], upper: NDArray[np.float64], spatial: Bits, window: Window
+) -> _Entries:
+    """The masks of the boxes that are not proved empty."""
     states = contract(scene.camera, lines.states(scene.camera, lower, upper))
     kept = ~(inverted(*states.theta.T) | inverted(*states.y.T))
-    lines, states = LineBoxes(lines.lower[kept], lines.upper[kept], lines.reference_row[kept]), states[kept]
-    spatial, window = spatial_filter(scene, lower, upper)
+    lines, states = lines[kept], states[kept]
     widen_px = scene.tolerance.line_px
     may_light = paint(clip_and_widen(scene, columns_that_may_be_lit(scene, states), widen_px), window) & spatial
     must_light = paint(clip_and_widen(scene, columns_that_must_be_lit(scene, states), -widen_px), window)
-    bank = CellBank(
-        lines=lines,
-        spatial=runs_of(spatial[None], window),
-        must_light=runs_of(must_light, window),
-        may_light=runs_of(may_light, window),
-        window=window,
-        state_lower=float32_below(states.lower),
-        state_upper=float32_above(states.upper),
-    )
-    _check_must_light(scene, bank, states)
-    return bank
+    return _Entries(lines, states, must_light, may_light)
 
 
-def _check_must_light(scene: Scene, bank: CellBank, states: StateSet) -> None:
-    sizes = bank.must_light_sizes
-    weakest = int(sizes.argmin())
-    if sizes[weakest] <= scene.tolerance.missed_budget:
-        low, high = states.lower[weakest], states.upper[weakest]
-        where = ", ".join(f"{name} {a:.4g}..{b:.4g}" for name, a, b in zip("θxyz", low, high, strict=True))
+def _halved(lines: LineBoxes, coordinate: str) -> LineBoxes:
+    """Each box as two halves along one line coordinate; along the scale where that coordinate is fixed."""
+    axis = LINE_COORDINATES.index(coordinate)
+    axes = np.where(lines.upper[:, axis] > lines.lower[:, axis], axis, LINE_COORDINATES.index("scale"))
+    each = np.arange(len(lines))
+    middle = (lines.lower[each, axes] + lines.upper[each, axes]) / 2
+    lower, upper = np.concatenate([lines.lower] * 2), np.concatenate([lines.upper] * 2)
+    upper[each, axes] = lower[len(lines) + each, axes] = middle
+    return LineBoxes(lower, upper, np.concatenate([lines.reference_row] * 2))
+
+
+def _demand_strong(scene: Scene, entries: _Entries) -> None:
+    weak = np.flatnonzero(entries.weak(scene.tolerance.missed_budget))
+    if len(weak):
+        low, high = entries.states.lower[weak[0]], entries.states.upper[weak[0]]
+        where = ", ".join(f"{name} {a:.4g}..{b:.4g}" for name, a, b in zip(STATE_NAMES, low, high, strict=True))
         raise SceneError(
-            f"bank: an entry ({where}) has only {sizes[weakest]} pixels that all of its states light, which does not exceed "
-            f"missed_budget {scene.tolerance.missed_budget}; keep the runway in view there, or make the bank finer"
+            f"bank: in {where}, only {entries.must_light[weak[0]].sum()} pixels are lit by all states however finely divided, which does "
+            f"not exceed missed_budget {scene.tolerance.missed_budget}; keep the runway in view there"
         )

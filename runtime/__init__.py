@@ -7,7 +7,20 @@ Conventions: `runtime.camera`. What is guaranteed: `runtime.estimator` and docs/
 """
 
 from runtime.estimator import Box, Estimate, Estimator, FrameError, Outcome
+from runtime.frames import EventError, FrameStream, events_to_frames
 from runtime.model_file import ModelError
 from runtime.scene import Scene, SceneError
 
-__all__ = ["Box", "Estimate", "Estimator", "FrameError", "ModelError", "Outcome", "Scene", "SceneError"]
+__all__ = [
+    "Box",
+    "Estimate",
+    "Estimator",
+    "EventError",
+    "FrameError",
+    "FrameStream",
+    "ModelError",
+    "Outcome",
+    "Scene",
+    "SceneError",
+    "events_to_frames",
+]

@@ -193,6 +193,10 @@ def _checked_to_the_end(path: Path, version: str | None, packets: Iterator[NDArr
         raise RecordingError(f"{path}: the file ends inside an event ({left} bytes of it); it was cut short, all events before it are kept")
 
 
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split())
+
+
 def _decoder(path: Path, **options: Any) -> Any:
     """faery's stream of the file."""
     try:
@@ -202,7 +206,7 @@ def _decoder(path: Path, **options: Any) -> Any:
     try:
         return faery.events_stream_from_file(path, **options)
     except Exception as error:  # faery raises bare Exception for a damaged file
-        raise RecordingError(f"{path}: {error}") from error
+        raise RecordingError(f"{path}: {_one_line(error)}; it is damaged, or not of this kind") from error
 
 
 def _converted(path: Path, packets: Any) -> Iterator[NDArray[Any]]:
@@ -210,8 +214,7 @@ def _converted(path: Path, packets: Any) -> Iterator[NDArray[Any]]:
         for packet in packets:
             yield _packet(packet["t"], packet["x"], packet["y"], packet["p"])
     except RuntimeError as error:
-        reason = " ".join(str(error).split())
-        raise RecordingError(f"{path}: damaged here: {reason}; all events before it are kept") from error
+        raise RecordingError(f"{path}: damaged here: {_one_line(error)}; all events before it are kept") from error
 
 
 def _packet(t: NDArray[Any], x: NDArray[Any], y: NDArray[Any], p: NDArray[Any]) -> NDArray[Any]:
@@ -234,7 +237,7 @@ def _npz_packets(path: Path) -> Iterator[NDArray[Any]]:
     except (OSError, ValueError, zipfile.BadZipFile, EOFError, NotImplementedError) as error:
         if isinstance(error, RecordingError):
             raise
-        raise RecordingError(f"{path}: cannot be read ({error}); give an npz file with arrays t, x, y, p") from error
+        raise RecordingError(f"{path}: cannot be read ({_one_line(error)}); give an npz file with arrays t, x, y, p") from error
     if missing:
         raise RecordingError(f"{path}: no array {', '.join(missing)}; the arrays t, x, y, p are needed")
     _check_lengths(path, lengths)
@@ -276,7 +279,7 @@ def _hdf5_file(path: Path) -> Any:
     try:
         return h5py.File(path, "r")
     except OSError as error:
-        raise RecordingError(f"{path}: cannot be read ({error}); give an HDF5 file with columns t, x, y, p") from error
+        raise RecordingError(f"{path}: cannot be read ({_one_line(error)}); give an HDF5 file with columns t, x, y, p") from error
 
 
 def _hdf5_columns(path: Path, file: Any) -> tuple[Any, dict[str, Any]]:
@@ -330,8 +333,7 @@ def _column_packets(path: Path, length: int, part: Callable[[str, int, int], NDA
         try:
             columns = {name: part(name, start, stop) for name in "txyp"}
         except Exception as error:  # a damaged file fails in zipfile, zlib or HDF5, with classes of their own
-            reason = " ".join(str(error).split())
-            raise RecordingError(f"{path}: events {start} to {stop}: {reason}; damaged, all events before them are kept") from error
+            raise RecordingError(f"{path}: events {start} to {stop}: {_one_line(error)}; damaged, all events before them are kept") from error
         for name, column in columns.items():
             limits = np.iinfo(EVENT[name])
             if not (limits.min <= int(column.min()) and int(column.max()) <= limits.max):

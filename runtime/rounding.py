@@ -14,7 +14,9 @@ OUTWARD_PX = 2.0**-20
 """Margin that every bound on a row or a column is widened by, in px."""
 
 OUTWARD_RELATIVE = 2.0**-30
-"""Share by which a lower bound must exceed an upper one before an interval of angles, altitudes or scales is called empty."""
+"""Share by which a lower bound must exceed an upper one before an interval of angles, altitudes or scales is called empty.
+
+Between -1 and 1 it is taken of 1: a pitch near 0 is the difference of larger angles, and has their error."""
 
 
 def below(values_px: ArrayLike) -> NDArray[np.float64]:
@@ -49,7 +51,7 @@ def last_crossed(stop_lower_px: ArrayLike) -> NDArray[np.int64]:
 
 def inverted(lower: ArrayLike, upper: ArrayLike) -> NDArray[np.bool_]:
     """True where lower exceeds upper by more than float64's error could: the interval between them is proved empty."""
-    return np.asarray(lower) > np.asarray(upper) + OUTWARD_RELATIVE * np.abs(upper)
+    return np.asarray(lower) > np.asarray(upper) + OUTWARD_RELATIVE * np.maximum(np.abs(upper), 1)
 
 
 def float32_below(values: ArrayLike) -> NDArray[np.float32]:

@@ -1,0 +1,239 @@
+"""bench-model: what a frame costs, beside the line detectors that the certified estimate replaces.
+
+All methods see the same frames, one after the other in every round, in one process on one thread, so that what else the machine does
+falls on all alike; ratios are medians over the pairs of neighbouring runs. A method's frames are the exact image of a random state of
+the domain under clutter, and those of a recording, if there is one.
+"""
+
+import csv
+import io
+import itertools
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+
+from runtime.estimator import Estimator
+from runtime.frames import FrameStream
+from runtime.image import runway_image
+from runtime.model_file import ModelError
+from runtime.scene import Scene
+
+Frames = Sequence[NDArray[np.uint8]]
+Method = Callable[[NDArray[np.uint8]], object]
+
+CLUTTER = (0.0, 0.01, 0.02, 0.05)
+WINDOW_US = 40_000
+REFERENCE = "HoughLinesP"
+"""The detector that ratios refer to."""
+USER_ERROR = 2
+
+
+@dataclass(frozen=True)
+class Latency:
+    """Milliseconds a frame of one method on one kind of frames; `ratio` is the median of its time over `REFERENCE`'s."""
+
+    frames: str
+    method: str
+    p50_ms: float
+    p99_ms: float
+    max_ms: float
+    ratio: float
+
+
+def cluttered_frames(scene: Scene, density: float, count: int, seed: int) -> Frames:
+    """Exact images of random states of the domain; each pixel is lit besides with probability `density`."""
+    rng = np.random.default_rng(seed)
+    images = (runway_image(scene, rng.uniform(scene.domain.lower, scene.domain.upper)) for _ in range(count))
+    return [image | (rng.random(image.shape) < density) for image in images]
+
+
+def recorded_frames(path: Path, shape: tuple[int, int], count: int) -> Frames:
+    """`count` frames of a recording, evenly spread over it. Raises `RecordingError` and `EventError`."""
+    from runtime.recording import read_events
+
+    frames = [frame for _, frame in FrameStream(shape, WINDOW_US).frames(read_events(path, shape))]
+    return [frames[index] for index in np.linspace(0, len(frames) - 1, min(count, len(frames))).astype(int)] if frames else []
+
+
+def methods(estimator: Estimator) -> dict[str, Method]:
+    """What is timed. The detectors take pixels of 0 and 255, which are made outside the clock."""
+    import cv2
+
+    cv2.setNumThreads(1)
+    segments = cv2.createLineSegmentDetector()
+    return {
+        "session.run": estimator.run,
+        "estimate, no refinement": lambda frame: estimator.estimate(frame, refine=False),
+        "estimate": estimator.estimate,
+        REFERENCE: lambda image: cv2.HoughLinesP(image, 1, np.pi / 180, 20, minLineLength=20, maxLineGap=3),
+        "HoughLines": lambda image: cv2.HoughLines(image, 1, np.pi / 180, 30),
+        "LSD": segments.detect,
+        "sum of bytes": lambda frame: frame.sum(),
+    }
+
+
+OF_OPENCV = (REFERENCE, "HoughLines", "LSD")
+
+
+def measure(timed: Mapping[str, Method], frames: Frames, rounds: int) -> dict[str, NDArray[np.float64]]:
+    """Milliseconds of every method on every frame, (rounds * frames,), in alternation.
+
+    Before it is timed, a method sees the frame before, so that it finds the caches as it leaves them itself, as in a loop of its own.
+    """
+    spent = {name: [] for name in timed}
+    before = frames[-1]
+    for frame in itertools.chain.from_iterable(itertools.repeat(frames, rounds)):
+        for name, method in timed.items():
+            earlier, given = ((part * np.uint8(255) if name in OF_OPENCV else part) for part in (before, frame))
+            method(earlier)
+            start = time.perf_counter()
+            method(given)
+            spent[name].append((time.perf_counter() - start) * 1e3)
+        before = frame
+    return {name: np.array(times) for name, times in spent.items()}
+
+
+def latencies(kind: str, spent: Mapping[str, NDArray[np.float64]]) -> list[Latency]:
+    """The table's rows for one kind of frames."""
+    rows = []
+    for name, times in spent.items():
+        p50, p99 = np.quantile(times, [0.5, 0.99]).tolist()
+        rows.append(Latency(kind, name, p50, p99, float(times.max()), float(np.median(times / spent[REFERENCE]))))
+    return rows
+
+
+def benchmark(
+    estimator: Estimator, count: int, rounds: int, recording: Path | None = None, seed: int = 0, clutter: Iterable[float] = CLUTTER
+) -> Iterator[list[Latency]]:
+    """The rows of one kind of frames after the other. Raises `RecordingError` and `EventError`."""
+    timed = methods(estimator)
+    for number, density in enumerate(clutter):
+        kind = f"{density:.0%} clutter" if density else "clean"
+        yield latencies(kind, measure(timed, cluttered_frames(estimator.scene, density, count, seed + number), rounds))
+    if recording is not None:
+        yield latencies("recording", measure(timed, recorded_frames(recording, estimator.scene.camera.shape, count), rounds))
+
+
+def machine() -> dict[str, str]:
+    """Processor and versions."""
+    import cv2
+
+    return {
+        "processor": processor(),
+        "cores": str(os.cpu_count()),
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "onnxruntime": onnxruntime.__version__,
+        "opencv": cv2.__version__,
+        "threads": "1",
+    }
+
+
+def processor() -> str:
+    """The processor's name, as far as the system tells it."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    return next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def as_csv(header: Mapping[str, str], rows: Sequence[Latency]) -> str:
+    """Comment lines `# name: value`, then a table."""
+    text = io.StringIO()
+    text.writelines(f"# {name}: {value}\n" for name, value in header.items())
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(Latency.__dataclass_fields__)
+    writer.writerows([f"{value:.4f}" if isinstance(value, float) else value for value in vars(row).values()] for row in rows)
+    return text.getvalue()
+
+
+def chart(header: Mapping[str, str], rows: Sequence[Latency]) -> NDArray[np.uint8]:
+    """Bars of the medians on a logarithmic scale, with a mark at p99: a picture (height, width, 3)."""
+    import cv2
+
+    left, right, top, line = 330, 140, 60, 22
+    kinds = list(dict.fromkeys(row.frames for row in rows))
+    height = top + line * (len(rows) + 2 * len(kinds)) + 20
+    picture = np.full((height, 1100, 3), 255, dtype=np.uint8)
+    low, high = np.log10(min(row.p50_ms for row in rows) / 2), np.log10(max(row.p99_ms for row in rows) * 1.2)
+
+    def across(milliseconds: float) -> int:
+        return int(left + (np.log10(milliseconds) - low) / (high - low) * (picture.shape[1] - left - right))
+
+    def write(text: str, x: int, y: int, size: float = 0.45) -> None:
+        cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, (40, 40, 40), 1, cv2.LINE_AA)
+
+    write("milliseconds a frame: bar p50, mark p99; log scale", 20, 25, 0.55)
+    write(", ".join(f"{name} {value}" for name, value in header.items()), 20, 47, 0.38)
+    y = top
+    for kind in kinds:
+        y += 2 * line
+        write(kind, 20, y - line // 2, 0.5)
+        for row in (row for row in rows if row.frames == kind):
+            ours = row.method.startswith(("session", "estimate"))
+            cv2.rectangle(picture, (left, y - 6), (across(row.p50_ms), y + 8), (170, 110, 40) if ours else (160, 160, 160), -1)
+            cv2.line(picture, (across(row.p99_ms), y - 8), (across(row.p99_ms), y + 10), (40, 40, 200), 2)
+            write(row.method, 40, y + 5)
+            write(f"{row.p50_ms:.3f} ms", picture.shape[1] - right + 20, y + 5)
+            y += line
+    return picture
+
+
+def bench_model_command() -> None:
+    """Entry point of `bench-model`."""
+    try:
+        import cv2
+        import typer
+        from rich.console import Console
+        from rich.table import Table
+    except ImportError as error:
+        raise SystemExit(f"bench-model: the package {error.name!r} is missing; pip install 'glideproof[recordings]'") from None
+
+    def bench_model(
+        model: Annotated[Path | None, typer.Argument(help="Model that export-model wrote; by default the paper's.")] = None,
+        frames: Annotated[int, typer.Option(min=1, help="Frames of each kind.")] = 50,
+        rounds: Annotated[int, typer.Option(min=1, help="How often each frame is seen.")] = 10,
+        recording: Annotated[Path | None, typer.Option(help="Event recording whose frames are timed too.")] = None,
+        output: Annotated[Path, typer.Option("-o", "--output", help="Folder for bench.csv and bench.png.")] = Path("out/bench"),
+        seed: Annotated[int, typer.Option(help="Seed of the frames.")] = 0,
+    ) -> None:
+        """Time the model beside OpenCV's line detectors, on one thread, on the same frames: table, bench.csv and bench.png."""
+        from runtime.frames import EventError
+        from runtime.recording import RecordingError
+
+        console = Console(width=None if sys.stdout.isatty() else 120)
+        rows: list[Latency] = []
+        try:
+            estimator = Estimator.load(model)
+            header = {"model": estimator.sha256[:16], **machine()}
+            console.print(", ".join(f"{name} {value}" for name, value in header.items()), highlight=False)
+            for kind in benchmark(estimator, frames, rounds, recording, seed):
+                console.print(_table(Table, kind))
+                rows += kind
+            output.mkdir(parents=True, exist_ok=True)
+            (output / "bench.csv").write_text(as_csv(header, rows), encoding="utf-8")
+            cv2.imwrite(str(output / "bench.png"), chart(header, rows))
+        except (ModelError, EventError, RecordingError, OSError) as error:
+            print(" ".join(str(error).split()), file=sys.stderr)
+            raise typer.Exit(USER_ERROR) from None
+
+    typer.run(bench_model)
+
+
+def _table(make: Callable[..., Any], rows: Sequence[Latency]) -> Any:
+    table = make("method", "p50 ms", "p99 ms", "max ms", "p99/p50", f"/ {REFERENCE}", title=rows[0].frames, title_justify="left")
+    for row in rows:
+        figures = (row.p50_ms, row.p99_ms, row.max_ms)
+        spread, ratio = f"{row.p99_ms / row.p50_ms:.2f}", f"{row.ratio:.3f} = 1/{1 / row.ratio:.1f}"
+        table.add_row(row.method, *(f"{figure:.3f}" for figure in figures), spread, ratio)
+    return table
