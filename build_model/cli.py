@@ -35,10 +35,13 @@ def export_model(
     estimator: Annotated[Path | None, typer.Option(help="Your own NN_e: float32 [1,1,height,width] to [1,4].")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the training.")] = 0,
     jobs: Annotated[int, typer.Option(min=1, help="Processes that build cells.")] = 2,
+    dask: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="dask.distributed scheduler whose workers build them instead.")
+    ] = None,
 ) -> None:
     """Build NN_F from the scene, train NN_e (or take yours), and write one ONNX file with both."""
     try:
-        from build_model.export import EstimatorError, export_model
+        from build_model.export import ClusterError, EstimatorError, export_model
         from runtime.scene import Scene, SceneError
     except ImportError as error:
         fail(f"export-model: the package {error.name!r} is missing; pip install 'glideproof[build]'")
@@ -47,8 +50,8 @@ def export_model(
     try:
         loaded = Scene.load(scene)
         with _progress(console) as bars:
-            report = export_model(loaded, target, estimator=estimator, seed=seed, jobs=jobs, progress=_Bars(bars).update)
-    except (SceneError, EstimatorError) as error:
+            report = export_model(loaded, target, estimator=estimator, seed=seed, jobs=jobs, dask=dask, progress=_Bars(bars).update)
+    except (SceneError, EstimatorError, ClusterError) as error:
         fail(error)
     except OSError as error:
         fail(f"{target}: cannot be written ({error.strerror}); the model that was there before is untouched")

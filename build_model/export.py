@@ -2,7 +2,7 @@
 
 The certified part is built cell by cell (`hough_bank`), laid out (`filter_network`) and written as a graph (`filter_graph`); NN_e is
 trained on frames that this very graph filters (`state_network`), or taken from the user; both become one graph, with everything that
-a runtime or a verifier must know in its metadata. The same scene, seed and versions give the same bytes, whatever `jobs` is.
+a runtime or a verifier must know in its metadata. The same scene, seed and versions give the same bytes, whoever builds the cells.
 """
 
 from __future__ import annotations
@@ -43,11 +43,17 @@ from runtime.scene import Scene
 Progress = Callable[[str, int, int, float | None], None]
 """Called with a stage, steps done, steps in all, and the loss where there is one."""
 NETWORK_PREFIX = "state_network/"
+CONNECT_SECONDS = 10
+"""How long the scheduler of a cluster may take to answer."""
 VERSIONS = ("glideproof", "numpy", "onnx", "onnxruntime", "torch")
 
 
 class EstimatorError(ValueError):
     """A user's network that cannot serve as NN_e."""
+
+
+class ClusterError(RuntimeError):
+    """A cluster that cannot be used."""
 
 
 @dataclass(frozen=True)
@@ -81,16 +87,24 @@ def _silent(_stage: str, _done: int, _total: int, _loss: float | None) -> None:
 
 
 def export_model(
-    scene: Scene, path: str | Path, *, estimator: str | Path | None = None, seed: int = 0, jobs: int = 1, progress: Progress = _silent
+    scene: Scene,
+    path: str | Path,
+    *,
+    estimator: str | Path | None = None,
+    seed: int = 0,
+    jobs: int = 1,
+    dask: str | None = None,
+    progress: Progress = _silent,
 ) -> ExportReport:
     """Builds the scene's model and writes it to `path`, whole or not at all.
 
-    `estimator`: an ONNX file to serve as NN_e in place of a trained one. Raises `SceneError` for a scene that has no certificate,
-    `EstimatorError` for a network that does not fit, OSError if the file cannot be written.
+    `estimator`: an ONNX file to serve as NN_e in place of a trained one. `jobs`, `dask`: who builds the cells (`build_banks`). Raises
+    `SceneError` for a scene that has no certificate, `EstimatorError` for a network that does not fit, `ClusterError` for a cluster that
+    cannot be used, OSError if the file cannot be written.
     """
     watch = _Stopwatch()
     with watch.stage("NN_F"):
-        banks = build_banks(scene, jobs, progress)
+        banks = build_banks(scene, jobs, progress, dask)
         tables = assemble(scene, banks)
         shift_px = check_calibration(scene, tables.window)
         filter_part = filter_graph(scene, tables)
@@ -113,15 +127,41 @@ def export_model(
     )
 
 
-def build_banks(scene: Scene, jobs: int = 1, progress: Progress = _silent) -> list[CellBank]:
-    """S, entries, O and K of every cell, in the order of the partition; cells are independent and built by `jobs` processes."""
+def build_banks(scene: Scene, jobs: int = 1, progress: Progress = _silent, dask: str | None = None) -> list[CellBank]:
+    """S, entries, O and K of every cell, in the order of the partition.
+
+    Cells are independent: `jobs` local processes build them, or the workers of the dask.distributed scheduler at the address `dask`,
+    who must have the same version of this package; cells of a worker that is lost are built by another one. Raises `ClusterError`.
+    """
     cells = partition(scene)
     work = (joblib.delayed(cell_bank)(scene, lower, upper) for lower, upper in zip(cells.lower, cells.upper, strict=True))
     banks = []
-    for bank in joblib.Parallel(n_jobs=jobs, return_as="generator")(work):
-        banks.append(bank)
-        progress("cells", len(banks), len(cells), None)
+    with _workers(jobs, dask):
+        for bank in joblib.Parallel(return_as="generator")(work):
+            banks.append(bank)
+            progress("cells", len(banks), len(cells), None)
     return banks
+
+
+@contextmanager
+def _workers(jobs: int, dask: str | None) -> Iterator[None]:
+    """Where joblib runs its calls: local processes, or a dask cluster."""
+    if dask is None:
+        with joblib.parallel_config(n_jobs=jobs):
+            yield
+        return
+    try:
+        from distributed import Client
+    except ImportError as error:
+        raise ClusterError(f"--dask {dask}: the package {error.name!r} is missing; pip install 'glideproof[cluster]'") from error
+    try:
+        client = Client(dask, timeout=CONNECT_SECONDS, set_as_default=False)
+    except (OSError, ValueError) as error:
+        raise ClusterError(
+            f"--dask {dask}: no scheduler answers there ({error}); start one with `dask scheduler`, or use --jobs"
+        ) from error
+    with client, joblib.parallel_config(backend="dask", client=client):
+        yield
 
 
 def filter_function(filter_part: onnx.GraphProto) -> Callable[[NDArray[np.uint8]], NDArray[np.uint8]]:

@@ -85,21 +85,32 @@ def _column_sums(g: GraphWriter, scene: Scene, tables: FilterTables) -> tuple[st
     g.constant("down", np.array(0, dtype=np.int64))
     g.whole("flat", -1)
     crop = g.node("Slice", "crop", "frame", first, stop, "rows_and_columns")
-    counted, sums = _sums(g, "frame", crop)
+    counted = g.node("Cast", "counted", crop, to=TensorProto.INT32)
+    sums = _sums(g, "frame", tables, counted)
     if tolerance == 0:
         return counted, sums
     g.whole("image_axes", 0, 1)
     image = g.node("Unsqueeze", "crop_image", crop, "image_axes")
     dilated = g.node("MaxPool", "dilated_image", image, kernel_shape=[2 * tolerance + 1] * 2, pads=[tolerance] * 4, strides=[1, 1])
-    _, witness_sums = _sums(g, "dilated", g.node("Squeeze", "dilated", dilated, "image_axes"))
-    return counted, g.node("Concat", "frame_and_witness_sums", sums, witness_sums, axis=0)
+    witnesses = g.node("Cast", "witnesses", g.node("Squeeze", "dilated", dilated, "image_axes"), to=TensorProto.INT32)
+    return counted, g.node("Concat", "all_sums", sums, _sums(g, "witness", tables, witnesses), axis=0)
 
 
-def _sums(g: GraphWriter, name: str, pixels: str) -> tuple[str, str]:
-    """The pixels as int32, and their flat sums down the columns, under a row of zeros."""
-    counted = g.node("Cast", f"{name}_counted", pixels, to=TensorProto.INT32)
-    padded = g.node("Pad", f"{name}_padded", counted, "row_of_zeros")
-    return counted, g.node("Reshape", f"{name}_sums", g.node("CumSum", f"{name}_column_sums", padded, "down"), "flat")
+def _sums(g: GraphWriter, name: str, tables: FilterTables, pixels: str) -> str:
+    """Flat sums down the columns, under a row of zeros; the right half, mirrored, is first added to the left one where masks are."""
+    if tables.runs.folded:
+        rows, columns = tables.window.shape
+        middle = tables.runs.columns
+        mirrored = np.tile(np.arange(columns - 1, middle - 1, -1, dtype=np.int32), (rows, 1))
+        left = g.node(
+            "Slice", f"{name}_left", pixels, g.whole(f"{name}_first", 0), g.whole(f"{name}_middle", middle), g.whole(f"{name}_axis", 1)
+        )
+        right = g.node(
+            "GatherElements", f"{name}_right", pixels, g.constant(f"{name}_mirrored", mirrored), axis=1
+        )  # a Slice by steps of -1 is slower
+        pixels = g.node("Add", f"{name}_folded", left, right)
+    padded = g.node("Pad", f"{name}_padded", pixels, "row_of_zeros")
+    return g.node("Reshape", f"{name}_sums", g.node("CumSum", f"{name}_column_sums", padded, "down"), "flat")
 
 
 def _lit(g: GraphWriter, tables: FilterTables, sums: str) -> str:

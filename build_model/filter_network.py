@@ -7,7 +7,6 @@ banks by integer matrix products, an argmax over the cells. The two share no ind
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -19,49 +18,12 @@ from torch import Tensor, nn
 from build_model.hough_bank import CellBank
 from build_model.partition import Partition, partition
 from build_model.pixel_mask import Window
+from build_model.run_table import RunTable, SpatialRuns, run_table, spatial_runs
 from runtime.rounding import float32_above, float32_below
 from runtime.scene import Scene
 
 NEVER = 2**20
 """|K| of the padding: more than any frame can light, so that padding never passes and is never the least mismatch."""
-
-
-BLOCK_COST = 2500
-"""What a further block of the run table costs, in runs: three nodes take as long as this many runs take to count."""
-
-
-@dataclass(frozen=True)
-class RunTable:
-    """All masks as look-ups into sums down the columns, sorted by their number of runs, most first.
-
-    A block (2, runs, masks) int32 adds that many runs to each of the first `masks` masks: the lit pixels of mask p are the sum over all
-    blocks that reach so far, and over k, of sums[block[0, k, p]] - sums[block[1, k, p]]. The indices are flat, into the (rows + 1,
-    columns) sums of the window; with a tolerance those of K come after, in the sums of the dilated frame. Unused runs are (0, 0).
-    """
-
-    blocks: tuple[NDArray[np.int32], ...]
-    spatial: NDArray[np.int32]
-    """The place p of S_i, (cells,)."""
-    must_light: NDArray[np.int32]
-    """The place of K_ij, (cells, entries); of some other mask in the padding."""
-    may_light: NDArray[np.int32]
-    """The place of O_ij, likewise."""
-
-    @property
-    def look_ups(self) -> int:
-        """Sums looked up a frame."""
-        return sum(block.size for block in self.blocks)
-
-
-@dataclass(frozen=True)
-class SpatialRuns:
-    """The runs of all S_i, to paint them: where each of them starts or stops, (ends,) each."""
-
-    cell: NDArray[np.int32]
-    index: NDArray[np.int32]
-    """Flat, into the window's pixels; the first one of a run, or the first one below it. A run down to the last row has no stop."""
-    step: NDArray[np.int32]
-    """1 at a start, -1 at a stop."""
 
 
 @dataclass(frozen=True)
@@ -104,8 +66,8 @@ def assemble(scene: Scene, banks: Sequence[CellBank]) -> FilterTables:
         window=window,
         cells=partition(scene),
         entries=entries,
-        runs=run_table(banks, entries, window, bool(scene.tolerance.line_px)),
-        spatial_runs=_spatial_runs(banks, window),
+        runs=run_table(banks, window, scene.tolerance.line_px > 0),
+        spatial_runs=spatial_runs(banks, window),
         must_light_size=padded((bank.must_light_sizes for bank in banks), NEVER).astype(np.int32),
         state_lower=padded(bank.state_lower for bank in banks),
         state_upper=padded(bank.state_upper for bank in banks),
@@ -113,73 +75,6 @@ def assemble(scene: Scene, banks: Sequence[CellBank]) -> FilterTables:
         line_upper=padded(bank.lines.upper for bank in banks),
         reference_row=padded(bank.lines.reference_row for bank in banks),
     )
-
-
-def run_table(banks: Sequence[CellBank], entries: int, window: Window, dilated: bool) -> RunTable:
-    """The masks of all cells as look-ups; `dilated`: K is counted in sums of its own."""
-    own_sums = (window.bottom - window.top + 1) * (window.right - window.left) if dilated else 0
-    groups = [
-        ([bank.spatial for bank in banks], 0),
-        ([bank.must_light for bank in banks], own_sums),
-        ([bank.may_light for bank in banks], 0),
-    ]
-    sizes = [np.ones(len(banks), dtype=np.int64), *[np.array([len(bank) for bank in banks])] * 2]
-    first = np.cumsum([0, *np.concatenate(sizes)])
-    mask, stop, start = [], [], []
-    for group, (runs, shift) in enumerate(groups):
-        for cell, part in enumerate(runs):
-            mask.append(part.mask + first[group * len(banks) + cell])
-            stop.append(_flat(window, part.stop, part.column) + shift)
-            start.append(_flat(window, part.start, part.column) + shift)
-    place, blocks = _blocks(np.concatenate(mask), np.concatenate(stop), np.concatenate(start), int(first[-1]))
-    spatial, must_light, may_light = (
-        np.stack([np.resize(place[low : low + size], longest) for low, size in zip(firsts, sizes[group], strict=True)])
-        for group, (firsts, longest) in enumerate(zip(first[:-1].reshape(3, -1), (1, entries, entries), strict=True))
-    )
-    return RunTable(blocks, spatial.ravel(), must_light, may_light)
-
-
-def _flat(window: Window, row: NDArray[np.int64], column: NDArray[np.int64]) -> NDArray[np.int64]:
-    return (row - window.top) * (window.right - window.left) + column - window.left
-
-
-def _blocks(
-    mask: NDArray[np.int64], stop: NDArray[np.int64], start: NDArray[np.int64], masks: int
-) -> tuple[NDArray[np.int32], tuple[NDArray[np.int32], ...]]:
-    """The place of every mask, and the blocks. Run k belongs to mask[k], which is sorted."""
-    runs = np.bincount(mask, minlength=masks)
-    order = np.argsort(-runs, kind="stable")
-    place = np.empty(masks, dtype=np.int32)
-    place[order] = np.arange(masks)
-    rank = np.arange(len(mask)) - np.searchsorted(mask, mask)
-    with_more = [int((runs > bound).sum()) for bound in range(runs.max())]
-    table = np.zeros((2, len(with_more), masks), dtype=np.int32)
-    table[:, rank, place[mask]] = stop, start
-    borders = block_borders([masks, *with_more[1:]])
-    return place, tuple(np.ascontiguousarray(table[:, low:high, : with_more[low] if low else masks]) for low, high in borders)
-
-
-def block_borders(masks_with: Sequence[int]) -> list[tuple[int, int]]:
-    """The cheapest division of runs into blocks. `masks_with[k]`: masks that have a k-th run, falling; a block is as wide as its first."""
-    count = len(masks_with)
-    cost, following = [0] * (count + 1), [count] * count
-    for low in reversed(range(count)):
-        cost[low], following[low] = min(
-            (BLOCK_COST + (high - low) * masks_with[low] + cost[high], high) for high in range(low + 1, count + 1)
-        )
-    borders = [0]
-    while borders[-1] < count:
-        borders.append(following[borders[-1]])
-    return list(itertools.pairwise(borders))
-
-
-def _spatial_runs(banks: Sequence[CellBank], window: Window) -> SpatialRuns:
-    cell = np.repeat(np.arange(len(banks)), [len(bank.spatial.mask) for bank in banks])
-    column, start, stop = (np.concatenate([getattr(bank.spatial, name) for bank in banks]) for name in ("column", "start", "stop"))
-    inside = stop < window.bottom
-    index = np.concatenate([_flat(window, start, column), _flat(window, stop, column)[inside]])
-    step = np.repeat([1, -1], [len(start), inside.sum()])
-    return SpatialRuns(*(part.astype(np.int32) for part in (np.concatenate([cell, cell[inside]]), index, step)))
 
 
 class FilterNetwork(nn.Module):

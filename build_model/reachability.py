@@ -48,8 +48,8 @@ ZETA_BITS = 22
 PIXELS_AT_ONCE = 128
 """Pixels whose Jacobians are held in memory together."""
 
-SUBDIVISIONS = 16
-"""Pieces of each free axis on which `paper_bound` bounds the Jacobian of h."""
+MOST_PIECES = 4096
+"""Pieces of the cell, equal in number along each free axis, on which `paper_bound` bounds the Jacobian of h."""
 
 
 class Method(StrEnum):
@@ -567,7 +567,8 @@ def _inverse_lipschitz_per_px(scene: Scene, lower: Floats, upper: Floats) -> lis
 
 
 def _pieces(lower: Floats, upper: Floats) -> Bounds:
-    """The box [lower, upper], both (4,), cut into SUBDIVISIONS pieces along each free axis: two arrays (pieces, 4)."""
-    edges = [np.linspace(low, high, SUBDIVISIONS + 1 if high > low else 2) for low, high in zip(lower, upper, strict=True)]
+    """The box [lower, upper], both (4,), cut into up to MOST_PIECES pieces along its free axes: two arrays (pieces, 4)."""
+    cuts = round(MOST_PIECES ** (1 / (upper > lower).sum()))
+    edges = [np.linspace(low, high, cuts + 1 if high > low else 2) for low, high in zip(lower, upper, strict=True)]
     pieces = np.array(list(itertools.product(*(itertools.pairwise(axis) for axis in edges))))
     return pieces[..., 0], pieces[..., 1]

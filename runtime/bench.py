@@ -84,7 +84,9 @@ def methods(estimator: Estimator) -> dict[str, Method]:
 OF_OPENCV = (REFERENCE, "HoughLines", "LSD")
 
 
-def measure(timed: Mapping[str, Method], frames: Frames, rounds: int) -> dict[str, NDArray[np.float64]]:
+def measure(
+    timed: Mapping[str, Method], frames: Frames, rounds: int, clock: Callable[[], float] = time.perf_counter
+) -> dict[str, NDArray[np.float64]]:
     """Milliseconds of every method on every frame, (rounds * frames,), in alternation.
 
     Before it is timed, a method sees the frame before, so that it finds the caches as it leaves them itself, as in a loop of its own.
@@ -95,9 +97,9 @@ def measure(timed: Mapping[str, Method], frames: Frames, rounds: int) -> dict[st
         for name, method in timed.items():
             earlier, given = ((part * np.uint8(255) if name in OF_OPENCV else part) for part in (before, frame))
             method(earlier)
-            start = time.perf_counter()
+            start = clock()
             method(given)
-            spent[name].append((time.perf_counter() - start) * 1e3)
+            spent[name].append((clock() - start) * 1e3)
         before = frame
     return {name: np.array(times) for name, times in spent.items()}
 
@@ -112,15 +114,21 @@ def latencies(kind: str, spent: Mapping[str, NDArray[np.float64]]) -> list[Laten
 
 
 def benchmark(
-    estimator: Estimator, count: int, rounds: int, recording: Path | None = None, seed: int = 0, clutter: Iterable[float] = CLUTTER
+    estimator: Estimator,
+    count: int,
+    rounds: int,
+    recording: Path | None = None,
+    seed: int = 0,
+    clock: Callable[[], float] = time.perf_counter,
+    clutter: Iterable[float] = CLUTTER,
 ) -> Iterator[list[Latency]]:
     """The rows of one kind of frames after the other. Raises `RecordingError` and `EventError`."""
     timed = methods(estimator)
     for number, density in enumerate(clutter):
         kind = f"{density:.0%} clutter" if density else "clean"
-        yield latencies(kind, measure(timed, cluttered_frames(estimator.scene, density, count, seed + number), rounds))
+        yield latencies(kind, measure(timed, cluttered_frames(estimator.scene, density, count, seed + number), rounds, clock))
     if recording is not None:
-        yield latencies("recording", measure(timed, recorded_frames(recording, estimator.scene.camera.shape, count), rounds))
+        yield latencies("recording", measure(timed, recorded_frames(recording, estimator.scene.camera.shape, count), rounds, clock))
 
 
 def machine() -> dict[str, str]:
@@ -204,6 +212,7 @@ def bench_model_command() -> None:
         frames: Annotated[int, typer.Option(min=1, help="Frames of each kind.")] = 50,
         rounds: Annotated[int, typer.Option(min=1, help="How often each frame is seen.")] = 10,
         recording: Annotated[Path | None, typer.Option(help="Event recording whose frames are timed too.")] = None,
+        cpu_time: Annotated[bool, typer.Option(help="Count the thread's time on the processor, if the machine is busy otherwise.")] = False,
         output: Annotated[Path, typer.Option("-o", "--output", help="Folder for bench.csv and bench.png.")] = Path("out/bench"),
         seed: Annotated[int, typer.Option(help="Seed of the frames.")] = 0,
     ) -> None:
@@ -215,9 +224,10 @@ def bench_model_command() -> None:
         rows: list[Latency] = []
         try:
             estimator = Estimator.load(model)
-            header = {"model": estimator.sha256[:16], **machine()}
+            clock = time.thread_time if cpu_time else time.perf_counter
+            header = {"model": estimator.sha256[:16], **machine(), "clock": clock.__name__}
             console.print(", ".join(f"{name} {value}" for name, value in header.items()), highlight=False)
-            for kind in benchmark(estimator, frames, rounds, recording, seed):
+            for kind in benchmark(estimator, frames, rounds, recording, seed, clock):
                 console.print(_table(Table, kind))
                 rows += kind
             output.mkdir(parents=True, exist_ok=True)

@@ -157,14 +157,14 @@ class History:
             self._every *= 2
 
 
-def draw_history(scene: Scene, history: History) -> Picture:
+def draw_history(scene: Scene, history: History, width: int = HISTORY_WIDTH) -> Picture:
     """State against time: a panel for each free axis of the domain, whose range it spans.
 
-    Amber: the certified band. Magenta: the estimate. White: the truth. Red, below: nothing is certified. Returns (height, 1280, 3).
+    Amber: the certified band. Magenta: the estimate. White: the truth. Red, below: nothing is certified. Returns (height, width, 3).
     """
     free = [axis for axis in range(4) if scene.domain.upper[axis] > scene.domain.lower[axis]]
     moments = history.moments or [Moment(0, 1, None, None, None, None)]
-    picture = np.full((len(free) * (PANEL_HEIGHT + PANEL_GAP) + 2 * LINE_HEIGHT, HISTORY_WIDTH, 3), BACKGROUND, dtype=np.uint8)
+    picture = np.full((len(free) * (PANEL_HEIGHT + PANEL_GAP) + 2 * LINE_HEIGHT, width, 3), BACKGROUND, dtype=np.uint8)
     seconds = moments[0].start_us / 1e6, moments[-1].stop_us / 1e6
     _write(picture, 0, [("certified band", BOX), ("estimate", STATE), ("truth", TRUTH), ("no runway", NO_RUNWAY)])
     for place, axis in enumerate(free):
@@ -178,17 +178,17 @@ def _draw_panel(panel: Picture, moments: Sequence[Moment], axis: int, low: float
     """One axis of the state over [low, high], with a fifth of that above and below."""
     import cv2
 
-    first, last = moments[0].start_us, moments[-1].stop_us
+    first, last, right_end = moments[0].start_us, moments[-1].stop_us, panel.shape[1] - 1
     margin = (high - low) / 5
 
     def column(time_us: float) -> int:
-        return PANEL_LEFT + int((time_us - first) / (last - first) * (HISTORY_WIDTH - 1 - PANEL_LEFT))
+        return PANEL_LEFT + int((time_us - first) / (last - first) * (right_end - PANEL_LEFT))
 
     def row(value: float) -> int:
         return int(np.clip((high + margin - value) / (high - low + 2 * margin), 0, 1) * (PANEL_HEIGHT - 1))
 
     for value in (low, high):
-        cv2.line(panel, (PANEL_LEFT, row(value)), (HISTORY_WIDTH - 1, row(value)), FRAME_BORDER, 1)
+        cv2.line(panel, (PANEL_LEFT, row(value)), (right_end, row(value)), FRAME_BORDER, 1)
         text = f"{STATE_NAMES[axis]} {value:.2f} {STATE_UNITS[axis]}"
         cv2.putText(panel, text, (8, row(value) + 5), cv2.FONT_HERSHEY_SIMPLEX, 0.45, TEXT, 1, cv2.LINE_AA)
     for moment in moments:

@@ -10,11 +10,7 @@ lies in the scene's domain, the camera is the scene's (no roll or yaw, the calib
 from __future__ import annotations
 
 import enum
-import itertools
-import multiprocessing
-from collections import deque
 from collections.abc import Iterable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -36,9 +32,6 @@ OUTPUTS = ("cell", "support", "mismatch", "passes", "cell_lower", "cell_upper", 
 BOX_TENSORS = ("state_lower", "state_upper", "line_lower", "line_upper", "reference_row")
 MASK_TENSORS = ("spatial_run_cell", "spatial_run_index", "spatial_run_step", "window_first", "window_stop")
 """Initialisers that hold every entry as a box of states and of line coordinates, and every cell's spatial mask."""
-
-CHUNK = 8
-"""Frames that `estimate_many` hands to a process at once."""
 
 
 class FrameError(ValueError):
@@ -139,7 +132,7 @@ class Estimator:
         self._fixed = self._domain_lower == self._domain_upper
         self._entries = _Entries.of(self.scene, model.tensors)
         self._refiner = Refiner(self.scene, int(self._budgets["missed_budget"]), int(self._budgets["extra_budget"]))
-        self._recipe = model.content, name, missed_budget, extra_budget
+        self._arguments = {"path": name, "missed_budget": missed_budget, "extra_budget": extra_budget, "sha256": model.sha256}
 
     @classmethod
     def load(
@@ -161,7 +154,7 @@ class Estimator:
             content = source.read_bytes()
         except OSError as error:
             raise ModelError(f"{source}: cannot be read ({error.strerror}); give the path of a model that export-model wrote") from error
-        model = _parsed(content, str(source))
+        model = parse_model(content, str(source), BOX_TENSORS + MASK_TENSORS)
         if sha256 is not None and sha256.lower() != model.sha256:
             raise ModelError(f"{source}: sha256 is {model.sha256}, the caller trusts {sha256}; take the file from its source again")
         return cls(model, str(source), threads, missed_budget, extra_budget)
@@ -205,22 +198,19 @@ class Estimator:
             touches_boundary=box is not None and self._touches_boundary(box),
         )
 
-    def estimate_many(self, frames: Iterable[NDArray], refine: bool = True, processes: int = 2) -> Iterator[Estimate]:
-        """`estimate` of every frame, in order, by several processes: the same answers to the last bit, from about 100 frames on sooner.
+    def estimate_many(self, frames: Iterable[NDArray], refine: bool = True, workers: int = 2) -> Iterator[Estimate]:
+        """`estimate` of every frame, in order, on several cores: the same answers to the last bit.
 
-        Frames are taken when they are needed, a few ahead. The processes are started afresh, so that a script that calls this needs the
-        usual `if __name__ == "__main__":`. Raises `FrameError` when it comes to a frame that the model cannot take.
+        Frames are taken a few ahead of the answers. Refinement needs processes, which read the model's file again and take about as long
+        to start as 100 frames; a script then needs the usual `if __name__ == "__main__":`. Raises `FrameError` when it comes to a frame
+        that the model cannot take, and from processes `ModelError` if the file has changed.
         """
+        from runtime.batch import by_processes, by_threads  # loads 3 MB that other programs can do without
+
         pixels = map(self._checked_frame, frames)
-        started: deque[Any] = deque()
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(processes, context, initializer=_load_here, initargs=self._recipe) as pool:
-            while chunk := list(itertools.islice(pixels, CHUNK)):
-                started.append(pool.submit(_estimate_here, chunk, refine))
-                if len(started) > 2 * processes:
-                    yield from started.popleft().result()
-            while started:
-                yield from started.popleft().result()
+        if refine:
+            return by_processes(self._arguments, self.scene.camera.width, pixels, workers)
+        return by_threads(self, pixels, workers)
 
     def spatial_mask(self, cell: int) -> NDArray[np.bool_]:
         """S of a cell, (height, width): every pixel that one of its states can light, widened by the tolerance."""
@@ -228,17 +218,23 @@ class Estimator:
 
     def _refined(self, frame: NDArray[np.bool_], passes: NDArray[np.bool_]) -> StateSet:
         """What is left of the passing entries. Theorem B's claims, which differ from cell to cell, are made at tolerance 0 only."""
-        witnesses = dilated(frame, self.scene.tolerance.line_px)
+        witnesses = self._witnesses(frame)
         if self._refiner.extra_budget < 0 or self.scene.tolerance.line_px > 0:
             return self._refiner.refine(witnesses, self._entries.sets(passes))
         cells = np.flatnonzero(passes.any(axis=1))
         alone = np.arange(len(passes))[:, None]
         return joined(
             *(
-                self._refiner.refine(witnesses, self._entries.sets(passes & (alone == cell)), self._entries.within(cell, frame))
+                self._refiner.refine(witnesses, self._entries.sets(passes & (alone == cell)), self._entries.within(int(cell), frame))
                 for cell in cells
             )
         )
+
+    def _witnesses(self, frame: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Lit where a lit pixel lies within `line_px` in the sup norm, or the frame ends: what belongs there may be seen outside of it."""
+        radius = self.scene.tolerance.line_px
+        wide = dilated(np.pad(frame, radius, constant_values=True), radius)
+        return wide[radius : radius + len(frame), radius : radius + frame.shape[1]]
 
     def _regions(self, pieces: StateSet) -> tuple[Box, ...]:
         """Boxes of the connected parts of the pieces."""
@@ -331,8 +327,8 @@ class _Entries:
         theta, x, y, z = states
         sets = StateSet(theta, x, y, z, scale, tangent_of_row(scene.camera, tensors["reference_row"].ravel()))
         window = tuple(slice(int(first), int(stop)) for first, stop in zip(tensors["window_first"], tensors["window_stop"], strict=True))
-        runs = (tensors[f"spatial_run_{part}"] for part in ("cell", "index", "step"))
-        return _Entries(sets, *runs, (window[0], window[1]))
+        cell, index, step = (tensors[f"spatial_run_{part}"].copy() for part in ("cell", "index", "step"))  # not to keep the file
+        return _Entries(sets, cell, index, step, (window[0], window[1]))
 
     def sets(self, passes: NDArray[np.bool_]) -> StateSet:
         """The entries that pass; `passes` is (cells, entries)."""
@@ -348,23 +344,6 @@ class _Entries:
         mask = steps.cumsum(axis=0) > 0
         seen[self.window] = crop & mask
         return seen
-
-
-def _parsed(content: bytes, name: str) -> ModelFile:
-    return parse_model(content, name, BOX_TENSORS + MASK_TENSORS)
-
-
-_estimator_here: Estimator
-"""The model of a process that `estimate_many` has started."""
-
-
-def _load_here(content: bytes, name: str, missed_budget: int | None, extra_budget: int | None) -> None:
-    global _estimator_here
-    _estimator_here = Estimator(_parsed(content, name), name, 1, missed_budget, extra_budget)
-
-
-def _estimate_here(frames: list[NDArray[np.uint8]], refine: bool) -> list[Estimate]:
-    return [_estimator_here.estimate(frame, refine=refine) for frame in frames]
 
 
 def _packaged_model() -> Path:

@@ -17,6 +17,7 @@ No event is lost without a word. What was good before a fault is given before th
   recording; of an ES file that is cut, the last event goes without a word, as the format does not say how many there are.
 - faery refuses a RAW or DAT file at the first event outside the geometry in its header. Such a file is read again without the
   geometry, and `runtime.frames` counts the events outside the sensor.
+- faery ends the whole process on some damaged AEDAT4 files: they are read by a process of their own, whose end is an error like another.
 - faery raises a time that runs backwards to the latest one before it; the other formats keep such times, and `runtime.frames`
   counts them.
 """
@@ -26,11 +27,15 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
+import os
 import re
 import shutil
+import subprocess
+import sys
 import tempfile
+import types
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +54,8 @@ HDF5_GROUPS = ("", "events", "CD/events")
 """Where an HDF5 file may hold the columns: at the top, as DSEC does, or as Prophesee does."""
 EVENT_BYTES = {"evt2": 4, "evt3": 2, "dat": 8}
 """Size of a word: a file ends with a whole one."""
+READER = "import sys; from runtime.recording import write_packets; write_packets(sys.argv[1])"
+"""What the process that reads an AEDAT4 file runs."""
 BINARY_DAT_HEADER_BYTES = 2
 """A DAT file's header is followed by the type and the size of its events."""
 COLUMN_NAMES = {"t": "t", "x": "x", "y": "y", "p": "p", "on": "p", "polarity": "p"}
@@ -92,6 +99,10 @@ def sensor_shape(path: str | Path) -> tuple[int, int] | None:
         raise RecordingError(f"{path}: the file is empty; record or copy it again")
     if path.suffix in (".raw", ".dat"):
         return _header_shape(_header(path)[0])
+    if path.suffix == ".aedat4":
+        with contextlib.closing(_read_apart(path)) as arrays:
+            height, width = next(arrays).tolist()
+        return height, width
     if path.suffix in FAERY_SUFFIXES:
         width, height = _decoder(path).dimensions()
         return height, width
@@ -138,7 +149,9 @@ def _shape(height: str, width: str) -> tuple[int, int] | None:
 def _faery_packets(path: Path, shape: tuple[int, int] | None) -> Iterator[NDArray[Any]]:
     if shape is None:
         raise RecordingError(f"{path}: the header tells no sensor size; give the (height, width)")
-    if path.suffix not in (".raw", ".dat"):
+    if path.suffix == ".aedat4":
+        return itertools.islice(_read_apart(path), 1, None)
+    if path.suffix == ".es":
         return _converted(path, _decoder(path))
     version = _raw_version(path) if path.suffix == ".raw" else None
     stream = _decoder(path, dimensions_fallback=(shape[1], shape[0]), version_fallback=version)
@@ -215,6 +228,42 @@ def _converted(path: Path, packets: Any) -> Iterator[NDArray[Any]]:
             yield _packet(packet["t"], packet["x"], packet["y"], packet["p"])
     except RuntimeError as error:
         raise RecordingError(f"{path}: damaged here: {_one_line(error)}; all events before it are kept") from error
+
+
+def write_packets(path: str) -> None:
+    """Writes a faery file to stdout as npy arrays: its (height, width), its packets, then the bytes of an error's text or none."""
+    # numpy takes a file of the operating system by its position, which a pipe has not: it is shown the methods alone.
+    out: Any = types.SimpleNamespace(write=sys.stdout.buffer.write)
+    text = ""
+    try:
+        stream = _decoder(Path(path))
+        np.lib.format.write_array(out, np.array(stream.dimensions()[::-1]))
+        for packet in _converted(Path(path), stream):
+            np.lib.format.write_array(out, packet)
+    except RecordingError as error:
+        text = str(error)
+    np.lib.format.write_array(out, np.frombuffer(text.encode(), dtype=np.uint8))
+
+
+def _read_apart(path: Path) -> Generator[NDArray[Any], None, None]:
+    """The arrays that `write_packets` writes in a process of its own. Raises `RecordingError` with its text, or if it breaks down."""
+    folders = [str(Path(__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(folders)}
+    command = [sys.executable, "-c", READER, str(path.resolve())]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment) as reader:
+        pipe: Any = types.SimpleNamespace(read=reader.stdout.read if reader.stdout else None)
+        try:
+            while True:
+                array = np.lib.format.read_array(pipe)
+                if array.dtype == np.uint8:
+                    break
+                yield array
+        except (ValueError, EOFError) as error:
+            raise RecordingError(f"{path}: damaged here: faery broke down on it; all events before it are kept") from error
+        finally:
+            reader.kill()
+    if len(array):
+        raise RecordingError(array.tobytes().decode())
 
 
 def _packet(t: NDArray[Any], x: NDArray[Any], y: NDArray[Any], p: NDArray[Any]) -> NDArray[Any]:
@@ -333,7 +382,9 @@ def _column_packets(path: Path, length: int, part: Callable[[str, int, int], NDA
         try:
             columns = {name: part(name, start, stop) for name in "txyp"}
         except Exception as error:  # a damaged file fails in zipfile, zlib or HDF5, with classes of their own
-            raise RecordingError(f"{path}: events {start} to {stop}: {_one_line(error)}; damaged, all events before them are kept") from error
+            raise RecordingError(
+                f"{path}: events {start} to {stop}: {_one_line(error)}; damaged, all events before them are kept"
+            ) from error
         for name, column in columns.items():
             limits = np.iinfo(EVENT[name])
             if not (limits.min <= int(column.min()) and int(column.max()) <= limits.max):

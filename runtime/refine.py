@@ -37,6 +37,8 @@ FACE_ROUNDS, FACE_PIECES, FACE_CUTS = 2, 2, (4, 3)
 """Last rounds: how many, how many pieces a face of the box, and into how many slices of theta and of z each is cut."""
 LARGEST_START = 512
 """More passing entries than this say that the frame tells next to nothing: they are left as they are, at a bounded cost."""
+MOST_TO_JOIN = 1024
+"""More pieces than this are taken for one connected part, whose hull is the same, at a bounded cost."""
 STATE_MARGIN = 2.0**-30
 """Margin on every side of a refined set, rad or m: far above the error of float64, far below anything an image tells."""
 NO_BOUND = 2.0**40
@@ -317,6 +319,8 @@ def _carries_a_face(sets: StateSet, pieces: int) -> Bits:
 
 def connected_parts(sets: StateSet) -> list[NDArray[np.int64]]:
     """Numbers of the sets in each connected part of their union: parts are joined where boxes (theta, x, y, z) touch."""
+    if len(sets) > MOST_TO_JOIN:
+        return [np.arange(len(sets))]
     lower, upper = sets.lower - STATE_MARGIN, sets.upper + STATE_MARGIN
     touch = np.logical_and.reduce((lower[:, None] <= upper[None]) & (lower[None] <= upper[:, None]), axis=-1)
     left: Bits = np.ones(len(sets), dtype=bool)

@@ -35,6 +35,7 @@ def estimate_of(box: Box | None, filtered: NDArray) -> Estimate:
         passing=np.array([] if box is None else [13, 14]),
         mismatch=0,
         filtered=filtered,
+        regions=() if box is None else (box,),
         touches_boundary=False,
     )
 

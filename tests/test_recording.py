@@ -117,18 +117,29 @@ def test_csv_is_read_in_packets(tmp_path):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.raw", b"", "found no format in the header; convert it to EVT2 or EVT3"),
+        ("a.raw", b"", "the file is empty"),
+        ("a.npz", b"", "the file is empty"),
+        ("a.h5", b"", "the file is empty"),
+        ("a.raw", b"MZ of another kind", "found no format in the header; convert it to EVT2 or EVT3"),
+        ("a.raw", b"\0" * 4096, "found no format in the header"),
+        ("a.dat", b"\0" * 4096, "a.dat: "),
+        ("a.es", b"\0" * 4096, "a.es: "),
+        ("a.aedat4", b"\0" * 4096, "a.aedat4: "),
+        ("a.npz", b"\0" * 4096, "cannot be read"),
+        ("a.csv", b"\0" * 4096, "no column t, x, y, p"),
+        ("a.h5", b"\0" * 4096, "cannot be read"),
+        ("a.hdf5", b"not an hdf5 file", "cannot be read"),
         ("a.raw", b"% evt 2.1\n% geometry 20x10\n% end\n", "found format 2.1"),
         ("a.raw", b"% format EVT21;height=10;width=20\n", "found format EVT21"),
         ("a.dat", b"not a dat file at all", "a.dat: "),
         ("a.es", b"not an es file at all", "a.es: "),
         ("a.aedat4", b"not an aedat file at all", "a.aedat4: "),
         ("a.npz", b"PK nothing", "cannot be read"),
-        ("a.csv", b"", "no column t, x, y, p in the first line"),
+        ("a.csv", b"", "the file is empty"),
         ("a.csv", b"t,x,y\n1,2,3\n", "no column p"),
-        ("a.csv", b"t,x,y,p\n1,2,3,1\n1.5,2,3,0\n", "lines 2 to 3: .*1.5"),
-        ("a.csv", b"1,2,3,1\n1,2\n", "lines 1 to 2"),
-        ("a.txt", b"1,2,3,1\n", "unknown kind '.txt'; known are .raw, .dat, .es, .aedat4, .csv, .npz"),
+        ("a.csv", b"t,x,y,p\n1,2,3,1\n1.5,2,3,0\n", "line 3: found 1.5,2,3,0; give whole numbers"),
+        ("a.csv", b"1,2,3,1\n1,2\n", "line 2: found 1,2;"),
+        ("a.txt", b"1,2,3,1\n", "unknown kind '.txt'; known are .raw, .dat, .es, .aedat4, .csv, .npz, .h5, .hdf5"),
     ],
 )
 def test_an_unreadable_file_is_an_error_of_one_line_that_names_it(tmp_path, name, content, message):
@@ -152,7 +163,7 @@ def test_an_unreadable_file_is_an_error_of_one_line_that_names_it(tmp_path, name
 def test_unusable_npz_columns_are_refused(tmp_path, columns, message):
     np.savez(tmp_path / "a.npz", **columns)
     with pytest.raises(RecordingError, match=message):
-        read_events(tmp_path / "a.npz")
+        list(read_events(tmp_path / "a.npz"))
 
 
 def test_a_missing_file_is_refused_at_once(tmp_path):
@@ -167,11 +178,133 @@ def test_without_faery_one_line_says_what_to_install(tmp_path, monkeypatch):
         read_events(tmp_path / "a.raw")
 
 
-def test_an_event_beyond_the_sensor_of_the_header_is_an_error(tmp_path):
-    path = written_by_faery(tmp_path / "a.raw", random_events(50), "evt3")
-    path.write_bytes(path.read_bytes().replace(b"20x10", b"19x10").replace(b"width=20", b"width=19"))
-    with pytest.raises(RecordingError, match="x overflow"):
-        read(path)
+@pytest.mark.parametrize(("name", "version"), [("a.raw", "evt2"), ("b.raw", "evt3"), ("c.dat", "dat2")])
+def test_events_beyond_the_sensor_of_the_header_are_counted_and_none_is_lost(tmp_path, name, version):
+    events = random_events(5000)
+    path = written_by_faery(tmp_path / name, events, version)
+    content = path.read_bytes()
+    path.write_bytes(content.replace(b"20x10", b"19x10").replace(b"width=20", b"width=19").replace(b"Width 20", b"Width 19"))
+    assert sensor_shape(path) == (10, 19)
+    back = read(path)
+    np.testing.assert_array_equal(np.sort(back, order=EVENT.names), np.sort(events, order=EVENT.names))
+    stream = FrameStream((10, 19), 1000)
+    list(stream.frames(read_events(path, (10, 19))))
+    assert stream.outside_events == np.count_nonzero(events["x"] == 19) > 0
+
+
+def read_until_a_fault(path: Path) -> tuple[NDArray, str]:
+    """What is read before the error, and its message; an empty one if there is none."""
+    packets, message = [np.empty(0, dtype=EVENT)], ""
+    try:
+        for packet in read_events(path, SHAPE):
+            packets.append(packet)
+    except RecordingError as error:
+        message = str(error)
+    assert "\n" not in message
+    return np.concatenate(packets), message
+
+
+@pytest.mark.parametrize(
+    ("name", "version", "bytes_an_event"), [("a.raw", "evt2", 4), ("b.raw", "evt3", 2), ("c.dat", "dat2", 8), ("d.es", None, 0)]
+)
+@pytest.mark.parametrize("cut", [1, 2, 3, 7, 50, 501])
+def test_of_a_file_that_was_cut_every_whole_event_is_read_and_a_cut_event_is_told(tmp_path, name, version, bytes_an_event, cut):
+    events = random_events(500)
+    path = written_by_faery(tmp_path / name, events, version)
+    content = path.read_bytes()
+    path.write_bytes(content[:-cut])
+    back, message = read_until_a_fault(path)
+    assert len(events) > len(back) >= len(events) - 1 - cut / 2
+    whole = read(written_by_faery(tmp_path / f"whole_{name}", events, version))
+    np.testing.assert_array_equal(back, whole[: len(back)])
+    assert ("ends inside an event" in message) == (bytes_an_event > 0 and cut % bytes_an_event > 0)
+    if bytes_an_event == 8:
+        assert len(back) == len(events) - -(-cut // 8)
+
+
+@pytest.mark.parametrize(("name", "version"), [("a.raw", "evt2"), ("b.raw", "evt3"), ("c.dat", "dat2"), ("d.es", None), ("e.aedat4", None)])
+def test_a_whole_file_is_not_called_cut(tmp_path, name, version):
+    for count in (1, 2, 500):
+        assert read_until_a_fault(written_by_faery(tmp_path / name, random_events(count), version))[1] == ""
+
+
+def test_a_cut_aedat4_file_is_an_error(tmp_path):
+    path = written_by_faery(tmp_path / "a.aedat4", random_events(500))
+    path.write_bytes(path.read_bytes()[:-100])
+    _, message = read_until_a_fault(path)
+    assert message.startswith(f"{path}: ")
+
+
+def test_csv_lines_before_a_fault_are_kept(tmp_path):
+    lines = [f"{time},3,4,1" for time in range(PACKET_EVENTS + 100)]
+    lines[PACKET_EVENTS + 37] = "12,nonsense,4,1"
+    (tmp_path / "a.csv").write_text("\n".join(lines))
+    back, message = read_until_a_fault(tmp_path / "a.csv")
+    np.testing.assert_array_equal(back["t"], np.arange(PACKET_EVENTS + 37))
+    assert f"line {PACKET_EVENTS + 38}: found 12,nonsense,4,1" in message
+
+
+def test_npz_events_before_damage_are_kept(tmp_path):
+    events = random_events(3 * PACKET_EVENTS)
+    path = tmp_path / "a.npz"
+    np.savez(path, t=events["t"], x=events["x"], y=events["y"], p=events["p"])
+    content = bytearray(path.read_bytes())
+    start = content.index(events["t"][2 * PACKET_EVENTS :][:100].tobytes())
+    content[start : start + 8] = b"\xff" * 8
+    path.write_bytes(content)
+    back, message = read_until_a_fault(path)
+    np.testing.assert_array_equal(back, events[: len(back)])
+    assert len(back) >= PACKET_EVENTS
+    assert "all events before them are kept" in message
+
+
+@pytest.mark.parametrize("place", ["", "events", "table"])
+@pytest.mark.parametrize("suffix", [".h5", ".hdf5"])
+def test_hdf5_is_read_in_packets_with_its_size_and_unsorted_times(tmp_path, place, suffix):
+    h5py = pytest.importorskip("h5py", reason="the extra 'recordings' is not installed")
+    events = random_events(PACKET_EVENTS + 10)
+    events["t"][[0, -1]] = events["t"][[-1, 0]]
+    path = tmp_path / f"a{suffix}"
+    with h5py.File(path, "w") as file:
+        holder = file if place == "" else file.create_group("CD" if place == "table" else place)
+        if place == "table":
+            holder = holder.create_dataset("events", data=events)
+        else:
+            for name in "txyp":
+                holder.create_dataset(name, data=events[name].astype(np.int64), chunks=True, compression="gzip")
+        holder.attrs["width"], holder.attrs["height"] = 20, 10
+    assert sensor_shape(path) == SHAPE
+    packets = list(read_events(path, SHAPE))
+    assert [len(packet) for packet in packets] == [PACKET_EVENTS, 10]
+    np.testing.assert_array_equal(np.concatenate(packets), events)
+    with pytest.raises(RecordingError, match="sensor of 20x10 px, expected 640x480"):
+        read_events(path, (480, 640))
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"t": [1], "x": [1], "y": [1]}, "no columns t, x, y, p at the top or in a group 'events'; found t, x, y"),
+        ({}, "found nothing"),
+        ({"t": [0.5], "x": [1], "y": [1], "p": [1]}, "t is float64"),
+        ({"t": [1, 2], "x": [1], "y": [1], "p": [1]}, "arrays of different lengths"),
+        ({"t": [1], "x": [2**40], "y": [1], "p": [1]}, "x runs from 1099511627776 to"),
+    ],
+)
+def test_unusable_hdf5_columns_are_refused(tmp_path, columns, message):
+    h5py = pytest.importorskip("h5py", reason="the extra 'recordings' is not installed")
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        for name, values in columns.items():
+            file.create_dataset(name, data=np.array(values))
+    with pytest.raises(RecordingError, match=message):
+        list(read_events(tmp_path / "a.h5"))
+
+
+def test_without_h5py_one_line_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    (tmp_path / "a.h5").write_bytes(b"anything")
+    with pytest.raises(RecordingError, match=r"needs h5py, .*pip install glideproof\[recordings\]"):
+        read_events(tmp_path / "a.h5")
 
 
 def test_the_real_recording_gives_its_events_and_frames():
@@ -186,3 +319,16 @@ def test_the_real_recording_gives_its_events_and_frames():
     assert len(lit) == 52  # 2.078 s of 40 ms
     assert 0.005 < np.median(lit) < 0.02
     assert (stream.late_events, stream.unsorted_events, stream.outside_events) == (0, 0, 0)
+
+
+def test_an_aedat4_file_that_breaks_faery_down_is_an_error_of_one_line(tmp_path):
+    """With bytes changed at random: some such files end the process that reads them."""
+    path = written_by_faery(tmp_path / "a.aedat4", random_events(300))
+    whole, drawn, faults = path.read_bytes(), np.random.default_rng(0), []
+    for _ in range(6):
+        content = np.frombuffer(whole, dtype=np.uint8).copy()
+        content[drawn.integers(len(content), size=40)] = drawn.integers(256, size=40)
+        path.write_bytes(content.tobytes())
+        faults.append(read_until_a_fault(path)[1])
+    assert all(fault == "" or fault.startswith(f"{path}: ") for fault in faults)
+    assert any(faults)

@@ -1,0 +1,129 @@
+"""Masks as look-ups: S, K and O of all cells, counted by sums of the frame down its columns.
+
+A mask is a few vertical runs (`build_model.pixel_mask`), and the lit pixels of a run are the sum down to its end less the sum down to
+its start. Sorting the masks by their number of runs leaves few look-ups without use. Where every mask is its own mirror image, as those
+of a runway straight ahead are, the frame is folded along that axis first, and half of the runs remain.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from build_model.hough_bank import CellBank
+from build_model.pixel_mask import Runs, Window
+
+BLOCK_COST = 2500
+"""What a further block costs, in runs: its nodes take as long as it takes to count this many."""
+
+
+@dataclass(frozen=True)
+class RunTable:
+    """All masks, sorted by their number of runs, most first.
+
+    A block (2, runs, masks) int32 adds that many runs to each of the first `masks` masks: the lit pixels of the mask at place p are the
+    sum, over all blocks that reach it and over k, of sums[block[0, k, p]] - sums[block[1, k, p]]. The sums are (rows + 1, `columns`),
+    flat: down the columns of the window, or of the window folded along its middle. With a tolerance the sums of the dilated frame follow,
+    which K is counted in. Unused runs are (0, 0).
+    """
+
+    blocks: tuple[NDArray[np.int32], ...]
+    columns: int
+    folded: bool
+    spatial: NDArray[np.int32]
+    """The place of S_i, (cells,)."""
+    must_light: NDArray[np.int32]
+    """The place of K_ij, (cells, entries); that of another mask of the cell in the padding."""
+    may_light: NDArray[np.int32]
+    """The place of O_ij, likewise."""
+
+    @property
+    def look_ups(self) -> int:
+        """Sums that are looked up in a frame."""
+        return sum(block.size for block in self.blocks)
+
+
+@dataclass(frozen=True)
+class SpatialRuns:
+    """Where the runs of all S_i start and stop, to paint them, (ends,) each."""
+
+    cell: NDArray[np.int32]
+    index: NDArray[np.int32]
+    """The first pixel of a run, or the first one below it, flat in the window. A run down to the last row has no stop."""
+    step: NDArray[np.int32]
+    """1 at a start, -1 at a stop."""
+
+
+def run_table(banks: Sequence[CellBank], window: Window, dilated: bool) -> RunTable:
+    """The masks of all cells as look-ups into the window's sums; `dilated`: those of K into sums of their own."""
+    entries = [len(bank) for bank in banks]
+    sizes = np.array([[1] * len(banks), entries, entries])
+    first = (np.cumsum(sizes) - sizes.ravel()).reshape(sizes.shape)
+    groups = [bank.spatial for bank in banks], [bank.must_light for bank in banks], [bank.may_light for bank in banks]
+    runs = _joined(list(itertools.chain(*groups)), first.ravel())
+    rows, columns = window.shape
+    if folded := mirrored(runs, window):
+        columns //= 2
+        left = runs.column < window.left + columns
+        runs = Runs(runs.mask[left], runs.column[left], runs.start[left], runs.stop[left])
+    in_must_light = (runs.mask >= first[1, 0]) & (runs.mask < first[2, 0])
+    base = runs.column - window.left + np.where(in_must_light & dilated, (rows + 1) * columns, 0)
+    ends = np.stack([(row - window.top) * columns + base for row in (runs.stop, runs.start)])
+    place, blocks = _blocks(runs.mask, ends, int(sizes.sum()))
+    places = [
+        np.stack([np.resize(place[start : start + size], group.max()) for start, size in zip(starts, group, strict=True)])
+        for starts, group in zip(first, sizes, strict=True)
+    ]
+    return RunTable(blocks, columns, folded, places[0].ravel(), places[1], places[2])
+
+
+def spatial_runs(banks: Sequence[CellBank], window: Window) -> SpatialRuns:
+    """The runs of every S_i, numbered by cell."""
+    runs = _joined([bank.spatial for bank in banks], np.arange(len(banks)))
+    inside = runs.stop < window.bottom
+    column = runs.column - window.left
+    start, stop = ((row - window.top) * window.shape[1] + column for row in (runs.start, runs.stop))
+    parts = (runs.mask, runs.mask[inside]), (start, stop[inside]), (np.ones(len(start)), -np.ones(inside.sum()))
+    return SpatialRuns(*(np.concatenate(part).astype(np.int32) for part in parts))
+
+
+def mirrored(runs: Runs, window: Window) -> bool:
+    """True if every mask is its own mirror image about the window's middle, which no column of pixels lies on."""
+    ends = np.stack([runs.start, runs.column, runs.mask])
+    image = np.stack([runs.start, window.left + window.right - 1 - runs.column, runs.mask])
+    to, back = np.lexsort(ends), np.lexsort(image)
+    return window.shape[1] % 2 == 0 and bool((ends[:, to] == image[:, back]).all() and (runs.stop[to] == runs.stop[back]).all())
+
+
+def _joined(parts: Sequence[Runs], first: NDArray[np.int64]) -> Runs:
+    """All masks in one list; `first` is the number of each part's first mask."""
+    mask = np.concatenate([part.mask + number for part, number in zip(parts, first, strict=True)])
+    return Runs(mask, *(np.concatenate([getattr(part, name) for part in parts]) for name in ("column", "start", "stop")))
+
+
+def _blocks(mask: NDArray[np.int64], ends: NDArray[np.int64], masks: int) -> tuple[NDArray[np.int32], tuple[NDArray[np.int32], ...]]:
+    """The place of every mask, and the blocks; run k, with ends (stop, start) in ends[:, k], belongs to mask[k], which is sorted."""
+    runs = np.bincount(mask, minlength=masks)
+    place = np.empty(masks, dtype=np.int32)
+    place[np.argsort(-runs, kind="stable")] = np.arange(masks)
+    rank = np.arange(len(mask)) - np.searchsorted(mask, mask)
+    table = np.zeros((2, runs.max(), masks), dtype=np.int32)
+    table[:, rank, place[mask]] = ends
+    reached = [masks, *(int((runs > bound).sum()) for bound in range(1, runs.max()))]
+    return place, tuple(np.ascontiguousarray(table[:, low:high, : reached[low]]) for low, high in block_borders(reached))
+
+
+def block_borders(reached: Sequence[int]) -> list[tuple[int, int]]:
+    """The cheapest division of runs into blocks [low, high). `reached[k]`: masks with a run k, falling; a block is as wide as its first."""
+    count = len(reached)
+    cost, following = [0] * (count + 1), [count] * count
+    for low in reversed(range(count)):
+        cost[low], following[low] = min((BLOCK_COST + (high - low) * reached[low] + cost[high], high) for high in range(low + 1, count + 1))
+    borders = [0]
+    while borders[-1] < count:
+        borders.append(following[borders[-1]])
+    return list(itertools.pairwise(borders))

@@ -1,0 +1,65 @@
+"""Many frames on several cores: the same estimates to the last bit, in the same order.
+
+Refinement is numpy, which holds Python's lock, and needs processes; frames travel between them as bits, 8 pixels to a byte. Without
+refinement most of the time is onnxruntime's, which works without the lock, and threads are enough.
+"""
+
+from __future__ import annotations
+
+import itertools
+import multiprocessing
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.estimator import Estimate, Estimator
+
+Frame = NDArray[np.uint8]
+CHUNK = 8
+"""Frames that a worker is given at once."""
+_estimator: Estimator
+"""The model of a process that `by_processes` has started."""
+
+
+def by_threads(estimator: Estimator, frames: Iterable[Frame], workers: int) -> Iterator[Estimate]:
+    """Estimates without refinement of frames that fit the model."""
+    with ThreadPoolExecutor(workers) as pool:
+        yield from _in_order(frames, workers, lambda chunk: pool.submit(_estimate_each, estimator, chunk, False))
+
+
+def by_processes(model: dict[str, Any], width: int, frames: Iterable[Frame], workers: int) -> Iterator[Estimate]:
+    """Refined estimates of frames of that width which fit the model; each process loads it by `Estimator.load(**model)`."""
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, context, initializer=_load, initargs=(model,)) as pool:
+        for estimate in _in_order(frames, workers, lambda chunk: pool.submit(_estimate_bits, np.packbits(chunk, axis=-1), width)):
+            yield replace(estimate, filtered=np.unpackbits(estimate.filtered, axis=-1, count=width))
+
+
+def _in_order(frames: Iterable[Frame], workers: int, submit: Callable[[list[Frame]], Future[list[Estimate]]]) -> Iterator[Estimate]:
+    """What the chunks give, in their order; takes at most 2 `workers` + 1 chunks ahead of what it has given."""
+    remaining, started = iter(frames), deque[Future[list[Estimate]]]()
+    while chunk := list(itertools.islice(remaining, CHUNK)):
+        started.append(submit(chunk))
+        if len(started) > 2 * workers:
+            yield from started.popleft().result()
+    while started:
+        yield from started.popleft().result()
+
+
+def _estimate_each(estimator: Estimator, frames: Iterable[Frame], refine: bool) -> list[Estimate]:
+    return [estimator.estimate(frame, refine=refine) for frame in frames]
+
+
+def _load(model: dict[str, Any]) -> None:
+    global _estimator
+    _estimator = Estimator.load(**model)
+
+
+def _estimate_bits(bits: NDArray[np.uint8], width: int) -> list[Estimate]:
+    estimates = _estimate_each(_estimator, np.unpackbits(bits, axis=-1, count=width), refine=True)
+    return [replace(estimate, filtered=np.packbits(estimate.filtered, axis=-1)) for estimate in estimates]

@@ -1,0 +1,175 @@
+"""What a frame, the file and the build cost as the domain is divided more finely, or grows.
+
+    python scripts/bench_scale.py [SCENE.toml] [-o out/scale] [--jobs 2]
+
+Two families: the paper's domain with cells of 0.1, 0.05 and 0.025, with fewer bins in a cell as cells shrink; and cells of 0.1 in domains
+of 27, 216 and 1,728 cells, placed where every state sees the whole runway. Prints a table, writes scale.csv and scale.png. NN_e, whose
+cost does not depend on the cells, is trained for one epoch only.
+"""
+
+from __future__ import annotations
+
+import csv
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import cv2
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from build_model.export import export_model
+from runtime import Estimator, Scene
+from runtime.bench import cluttered_frames, machine
+from runtime.scene import Axis, Bank, Domain, EstimatorTraining
+
+CLUTTER = 0.02
+QUICK = EstimatorTraining(training_frames=256, epochs=1)
+
+
+@dataclass(frozen=True)
+class Size:
+    """A scene's figures. `ratio` is the median of the time of `run` over that of the first scene."""
+
+    family: str
+    cells: int
+    entries: int
+    look_ups: int
+    file_mb: float
+    build_s: float
+    run_ms: float
+    ratio: float
+    estimate_ms: float
+    passing_cells: float
+
+
+def tiled(lower: float, count: int, width: float) -> Axis:
+    """`count` cells of the given width from `lower` on."""
+    return Axis(tuple(np.round(lower + width * (np.arange(count) + 0.5), 9).tolist()), width)
+
+
+def scenes(paper: Scene) -> list[tuple[str, Scene]]:
+    """Both families, each from 27 cells to 1,728."""
+    x = paper.domain.axes[1]
+    chosen = [("finer", paper)]
+    for count, width, pitch_bins, distance_bins in ((6, 0.05, 2, 1), (12, 0.025, 1, 1)):
+        domain = Domain(tiled(0.45, count, width), x, tiled(0.75, count, width), tiled(1.55, count, width))
+        bank = Bank(pitch_bins=pitch_bins, distance_bins=distance_bins, column_px=paper.bank.column_px, lateral_px=paper.bank.lateral_px)
+        chosen.append(("finer", replace(paper, domain=domain, bank=bank)))
+    for y, z in (((0.75, 8), (1.55, 9)), ((2.2, 24), (4.5, 24))):
+        domain = Domain(tiled(0.4, 3, 0.1), x, tiled(y[0], y[1], 0.1), tiled(z[0], z[1], 0.1))
+        chosen.append(("larger", replace(paper, domain=domain)))
+    return [(family, replace(scene, estimator=QUICK)) for family, scene in chosen]
+
+
+def run_times(estimators: Sequence[Estimator], count: int, rounds: int, clock: Callable[[], float]) -> NDArray[np.float64]:
+    """Milliseconds of `run`, (models, rounds * count), in alternation; each model on its own frames, the one before run untimed."""
+    frames = [cluttered_frames(estimator.scene, CLUTTER, count, seed=0) for estimator in estimators]
+    spent = np.zeros((len(estimators), rounds * count))
+    for turn in range(rounds * count):
+        for number, estimator in enumerate(estimators):
+            estimator.run(frames[number][turn - 1 - count * (turn // count)])
+            start = clock()
+            estimator.run(frames[number][turn % count])
+            spent[number, turn] = (clock() - start) * 1e3
+    return spent
+
+
+def estimate_time(estimator: Estimator, count: int, clock: Callable[[], float]) -> tuple[float, float]:
+    """Median milliseconds of `estimate`, and the mean number of passing cells."""
+    spent, passing = [], []
+    for frame in cluttered_frames(estimator.scene, CLUTTER, count, seed=1):
+        start = clock()
+        passing.append(len(estimator.estimate(frame).passing))
+        spent.append((clock() - start) * 1e3)
+    return float(np.median(spent)), float(np.mean(passing))
+
+
+def look_ups(path: Path) -> int:
+    """Sums that the model looks up in a frame for S, K and O."""
+    import onnx
+
+    return sum(int(np.prod(tensor.dims)) for tensor in onnx.load(path).graph.initializer if tensor.name.startswith("runs_"))
+
+
+def plot(sizes: Sequence[Size]) -> NDArray[np.uint8]:
+    """Milliseconds of `run` against cells, both axes logarithmic: a picture (500, 720, 3)."""
+    picture = np.full((500, 720, 3), 255, dtype=np.uint8)
+    cells, times = np.log([size.cells for size in sizes]), np.log([size.run_ms for size in sizes])
+    low, high = np.floor(times.min() / np.log(2)) * np.log(2), np.ceil(times.max() / np.log(2)) * np.log(2)
+
+    def point(cell: float, milliseconds: float) -> tuple[int, int]:
+        return int(80 + 560 * (cell - cells[0]) / (cells.max() - cells[0])), int(430 - 370 * (milliseconds - low) / max(high - low, 1e-9))
+
+    def write(text: str, x: int, y: int) -> None:
+        cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (40, 40, 40), 1, cv2.LINE_AA)
+
+    for level in np.arange(low, high + 0.01, np.log(2)):
+        y = point(cells[0], level)[1]
+        cv2.line(picture, (80, y), (640, y), (220, 220, 220), 1)
+        write(f"{np.exp(level):.2g} ms", 15, y + 5)
+    for number, (family, colour) in enumerate((("finer", (170, 110, 40)), ("larger", (40, 40, 200)))):
+        chosen = [0, *(index for index, size in enumerate(sizes) if index and size.family == family)]
+        points = [point(cells[index], times[index]) for index in chosen]
+        cv2.polylines(picture, [np.array(points)], False, colour, 2, cv2.LINE_AA)
+        for index, place in zip(chosen, points, strict=True):
+            cv2.circle(picture, place, 5, colour, -1, cv2.LINE_AA)
+            write(f"{sizes[index].cells}", place[0] - 15, 455)
+        write({"finer": "the same domain, finer cells", "larger": "cells of 0.1, a larger domain"}[family], 110, 40 + 20 * number)
+        cv2.rectangle(picture, (85, 30 + 20 * number), (100, 40 + 20 * number), colour, -1)
+    write("cells; time of one run of the model, one thread", 230, 485)
+    return picture
+
+
+def table(sizes: Sequence[Size]) -> Table:
+    """The figures for people."""
+    view = Table("family", "cells", "entries", "look-ups", "file MB", "NN_F s", "run ms", "/ 27", "estimate ms", "passing cells")
+    for size in sizes:
+        times = (f"{size.build_s:.1f}", f"{size.run_ms:.3f}", f"{size.ratio:.2f}", f"{size.estimate_ms:.1f}", f"{size.passing_cells:.1f}")
+        view.add_row(size.family, f"{size.cells:,}", f"{size.entries:,}", f"{size.look_ups:,}", f"{size.file_mb:.1f}", *times)
+    return view
+
+
+def main(
+    scene: Annotated[Path, typer.Argument(help="The paper's scene.")] = Path("models/paper.toml"),
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for scale.csv, scale.png and the models.")] = Path("out/scale"),
+    jobs: Annotated[int, typer.Option(help="Processes that build cells.")] = 2,
+    frames: Annotated[int, typer.Option(help="Frames of each model.")] = 50,
+    rounds: Annotated[int, typer.Option(help="How often each frame is run.")] = 4,
+    cpu_time: Annotated[bool, typer.Option(help="Count the thread's time on the processor, if the machine is busy otherwise.")] = False,
+) -> None:
+    """Build every scene, time it, print the table."""
+    output.mkdir(parents=True, exist_ok=True)
+    console = Console(width=140)
+    clock = time.thread_time if cpu_time else time.perf_counter
+    reports, paths = [], []
+    for family, chosen in scenes(Scene.load(scene)):
+        path = output / f"{family}-{chosen.domain.cell_count}.onnx"
+        reports.append((family, export_model(chosen, path, jobs=jobs)))
+        paths.append(path)
+        console.print(f"{path}: NN_F in {reports[-1][1].seconds['NN_F']:.1f} s")
+    estimators = [Estimator.load(path) for path in paths]
+    spent = run_times(estimators, frames, rounds, clock)
+    sizes = []
+    for (family, report), path, estimator, times in zip(reports, paths, estimators, spent, strict=True):
+        ratio = float(np.median(times / spent[0]))
+        estimate_ms, passing = estimate_time(estimator, frames, clock)
+        size = report.cells, report.entries, look_ups(path), report.file_bytes / 1e6, report.seconds["NN_F"]
+        sizes.append(Size(family, *size, float(np.median(times)), ratio, estimate_ms, passing))
+    header = {**machine(), "clock": clock.__name__}
+    console.print(", ".join(f"{name} {value}" for name, value in header.items()), table(sizes), highlight=False)
+    with (output / "scale.csv").open("w", newline="", encoding="utf-8") as file:
+        file.writelines(f"# {name}: {value}\n" for name, value in header.items())
+        writer = csv.writer(file)
+        writer.writerow(Size.__dataclass_fields__)
+        writer.writerows(vars(size).values() for size in sizes)
+    cv2.imwrite(str(output / "scale.png"), plot(sizes))
+
+
+if __name__ == "__main__":
+    typer.run(main)

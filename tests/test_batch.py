@@ -1,0 +1,69 @@
+"""estimate_many gives what estimate gives, to the last bit, in the same order, and takes no more frames than it must."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Iterator
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from runtime.batch import CHUNK
+from runtime.bench import cluttered_frames
+from runtime.estimator import Box, Estimate, Estimator, FrameError
+
+
+def same(first: Estimate, second: Estimate) -> bool:
+    return all(same_value(getattr(first, field.name), getattr(second, field.name)) for field in fields(Estimate))
+
+
+def same_value(first: object, second: object) -> bool:
+    if isinstance(first, Box) and isinstance(second, Box):
+        return bool((first.lower == second.lower).all() and (first.upper == second.upper).all())
+    if isinstance(first, tuple) and isinstance(second, tuple):
+        return len(first) == len(second) and all(map(same_value, first, second))
+    return type(first) is type(second) and np.array_equal(np.asarray(first), np.asarray(second))
+
+
+@pytest.fixture(scope="module")
+def estimator(estimator_of: Callable[..., Estimator]) -> Estimator:
+    return estimator_of("one cell")
+
+
+@pytest.fixture(scope="module")
+def frames(estimator: Estimator) -> list[NDArray[np.uint8]]:
+    """More than one chunk, the last one not full; one frame without a runway and one of bool."""
+    drawn = [*cluttered_frames(estimator.scene, 0.02, 2 * CHUNK, seed=5), np.zeros(estimator.scene.camera.shape, dtype=np.uint8)]
+    return [*drawn, drawn[0].astype(np.bool_)]
+
+
+@pytest.mark.parametrize("refine", [True, False])
+def test_many_frames_give_what_each_gives_alone(estimator: Estimator, frames: list[NDArray[np.uint8]], refine: bool) -> None:
+    alone = [estimator.estimate(frame, refine=refine) for frame in frames]
+    assert not all(same(alone[0], estimate) for estimate in alone[1:])
+    together = list(estimator.estimate_many(frames, refine=refine))
+    assert len(together) == len(alone)
+    assert [number for number, pair in enumerate(zip(alone, together, strict=True)) if not same(*pair)] == []
+    assert all(not estimate.box.lower.flags.writeable for estimate in together if estimate.box is not None)
+
+
+def test_an_endless_stream_is_taken_only_a_few_frames_ahead(estimator: Estimator, frames: list[NDArray[np.uint8]]) -> None:
+    taken = []
+
+    def endless() -> Iterator[NDArray[np.uint8]]:
+        for number in itertools.count():
+            taken.append(number)
+            yield frames[number % len(frames)]
+
+    estimates = estimator.estimate_many(endless(), refine=False, workers=2)
+    first = list(itertools.islice(estimates, 3))
+    assert same(first[2], estimator.estimate(frames[2], refine=False))
+    assert len(taken) == 5 * CHUNK
+
+
+def test_a_frame_that_does_not_fit_is_an_error_when_its_turn_comes(estimator: Estimator, frames: list[NDArray[np.uint8]]) -> None:
+    estimates = estimator.estimate_many([*frames[:CHUNK], frames[0][1:]], refine=False, workers=1)
+    with pytest.raises(FrameError, match=r"found \(479, 640\) of uint8"):
+        list(estimates)

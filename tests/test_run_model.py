@@ -1,0 +1,291 @@
+"""run-model and replay: what is written of a recording, and what is said of one that cannot be used."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+pytest.importorskip("cv2", reason="the extra 'recordings' is not installed")
+pytest.importorskip("typer", reason="the extra 'recordings' is not installed")
+
+import cv2
+import replay
+import typer
+from typer.testing import CliRunner, Result
+
+from runtime import Estimator
+from runtime.cli import run_model
+from runtime.draw import MOST_MOMENTS, History, Moment, draw_history
+from runtime.frames import FrameStream
+from runtime.image import runway_image
+from runtime.recording import EVENT
+from runtime.report import COLUMNS, TRUTH_COLUMNS, Truth, TruthError, missed_pixels
+
+MODEL = Path(__file__).parents[1] / "models" / "paper.onnx"
+RECORDINGS = Path(os.environ.get("GLIDEPROOF_RECORDINGS", Path(__file__).resolve().parents[2] / "shared" / "recordings"))
+WINDOWS = 25
+STATES = np.linspace([0.50, 0, 1.00, 1.80], [0.68, 0, 0.80, 1.62], WINDOWS)
+
+
+@pytest.fixture(scope="module")
+def estimator() -> Estimator:
+    return Estimator.load(MODEL)
+
+
+@pytest.fixture(scope="module")
+def events(estimator: Estimator) -> NDArray:
+    """One second: in every 40 ms the runway's exact image and 1 % clutter; the eighth window has no runway."""
+    drawn, packets = np.random.default_rng(0), []
+    for number, state in enumerate(STATES):
+        frame = drawn.random(estimator.scene.camera.shape) < 0.01
+        lit = np.nonzero(frame if number == 7 else frame | (runway_image(estimator.scene, state) != 0))
+        packet = np.zeros(len(lit[0]), dtype=EVENT)
+        packet["y"], packet["x"] = lit
+        packet["t"] = np.sort(drawn.integers(40_000 * number, 40_000 * (number + 1), len(packet)))
+        packet["t"][0] = 40_000 * number
+        packets.append(packet)
+    return np.concatenate(packets)
+
+
+@pytest.fixture(scope="module")
+def recording(events: NDArray, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("recordings") / "second.npz"
+    np.savez(path, t=events["t"], x=events["x"], y=events["y"], p=events["p"])
+    return path
+
+
+@pytest.fixture(scope="module")
+def truth(recording: Path) -> Path:
+    path = recording.parent / "truth.csv"
+    rows = np.column_stack([40_000 * np.arange(WINDOWS) + 20_000, STATES])
+    np.savetxt(path, rows, delimiter=",", header="time_us,theta_rad,x_m,y_m,z_m", comments="", fmt=["%d", *["%.17g"] * 4])
+    return path
+
+
+def invoke(*arguments: object) -> Result:
+    app = typer.Typer()
+    app.command()(run_model)
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def rows_of(folder: Path) -> list[dict[str, str]]:
+    with (folder / "estimates.csv").open() as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_recording_becomes_a_table_a_summary_pictures_and_a_video(recording, truth, estimator, tmp_path):
+    done = invoke(MODEL, recording, "-o", tmp_path, "--truth", truth)
+    assert (done.exit_code, done.stderr) == (0, "")
+    rows = rows_of(tmp_path)
+    assert list(rows[0]) == [*COLUMNS, *TRUTH_COLUMNS]
+    assert [int(row["time_us"]) for row in rows] == [40_000 * number for number in range(WINDOWS)]
+    for number, (row, state) in enumerate(zip(rows, STATES, strict=True)):
+        if number == 7:
+            assert row["assumptions_hold"] == "0"
+            continue
+        lower, upper = ([float(row[f"{side}_{name}"]) for name in ("theta_rad", "y_m", "z_m")] for side in ("lower", "upper"))
+        assert row["outcome"] == "certified"
+        assert (row["missed"], row["assumptions_hold"], row["truth_inside"]) == ("0", "1", "1")
+        assert (np.less_equal(lower, state[[0, 2, 3]]) & np.less_equal(state[[0, 2, 3]], upper)).all()
+        assert float(row["error_2norm"]) < 0.15
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["assumptions_hold"]["windows"] == summary["assumptions_hold"]["inside"] == WINDOWS - 1
+    assert summary["windows"] == WINDOWS == summary["certified"] + summary["no_runway"]
+    assert summary["sha256"] == estimator.sha256
+    assert summary["fault"] is None
+    video = cv2.VideoCapture(str(tmp_path / "overlay.mp4"))
+    assert (video.get(cv2.CAP_PROP_FRAME_COUNT), video.get(cv2.CAP_PROP_FPS)) == (WINDOWS, 25)
+    for name in [*(f"overlay_{number:06d}.png" for number in range(0, WINDOWS, 4)), "state.png"]:
+        assert cv2.imread(str(tmp_path / name)).shape[1] == 1280
+    assert not list(tmp_path.glob("*.part*"))
+
+
+def test_the_estimates_are_the_estimators_own(recording, events, estimator, tmp_path):
+    assert invoke(MODEL, recording, "-o", tmp_path, "--no-video").exit_code == 0
+    assert not (tmp_path / "overlay.mp4").exists()
+    for row, (_, frame) in zip(rows_of(tmp_path), FrameStream((480, 640), 40_000).frames([events]), strict=True):
+        estimate = estimator.estimate(frame)
+        assert (row["outcome"], int(row["cell"]), int(row["mismatch"])) == (estimate.outcome.value, estimate.cell, estimate.mismatch)
+        if estimate.state is not None:
+            assert [float(row[name]) for name in ("theta_rad", "x_m", "y_m", "z_m")] == estimate.state.tolist()
+
+
+def test_windows_may_overlap_and_the_budget_be_changed(recording, tmp_path):
+    done = invoke(MODEL, recording, "-o", tmp_path, "--no-video", "--window-ms", 40, "--step-ms", 20, "--missed-budget", 3, "--no-refine")
+    assert done.exit_code == 0
+    assert [int(row["time_us"]) for row in rows_of(tmp_path)] == [20_000 * number for number in range(2 * WINDOWS)]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--window-ms", "0"], "window_us: found 0"),
+        (["--window-ms", "nan"], "window_us"),
+        (["--step-ms", "80"], "step_us: found 80000, above window_us 40000"),
+        (["--missed-budget", "9999"], "missed_budget 9999"),
+        (["--truth", "no.csv"], "no.csv"),
+    ],
+)
+def test_options_that_cannot_be_used_are_an_error_of_one_line(recording, tmp_path, options, message):
+    done = invoke(MODEL, recording, "-o", tmp_path / "out", *options)
+    assert done.exit_code == 2
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("empty.raw", b"", "the file is empty"),
+        ("foreign.raw", b"GIF89a", "found no format in the header"),
+        ("none.raw", b"% evt 3.0\n% geometry 640x480\n% end\n", "no event in it"),
+        ("other.csv", b"t,x@320,y@240,p\n1,2,3,1\n", "sensor of 320x240 px, expected 640x480"),
+        ("zeros.npz", b"\0" * 100, "cannot be read"),
+        ("faulty.csv", b"t,x,y,p\n1,2,3,one\n", "line 2: found 1,2,3,one"),
+        ("kind.txt", b"1", "unknown kind '.txt'"),
+    ],
+)
+def test_an_unusable_recording_is_an_error_of_one_line_and_nothing_is_written(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    done = invoke(MODEL, tmp_path / name, "-o", tmp_path / "out")
+    assert done.exit_code == 2
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_of_a_damaged_recording_what_was_good_is_estimated(events, tmp_path):
+    good = events[events["t"] < 400_000]
+    lines = [f"{t},{x},{y},{p}" for t, x, y, p in good.tolist()]
+    (tmp_path / "cut.csv").write_text("\n".join([*lines, "400000,12"]))
+    done = invoke(MODEL, tmp_path / "cut.csv", "-o", tmp_path / "out", "--no-video")
+    assert done.exit_code == 1
+    assert f"line {len(lines) + 1}: found 400000,12" in done.stderr
+    assert "10 windows are written" in done.stderr
+    assert len(rows_of(tmp_path / "out")) == 10
+    assert "found 400000,12" in json.loads((tmp_path / "out" / "summary.json").read_text())["fault"]
+
+
+def test_unsorted_and_outside_events_are_told(events, tmp_path):
+    changed = events.copy()
+    changed["t"][5000], changed["x"][10:13] = 3, 640
+    np.savez(tmp_path / "a.npz", t=changed["t"], x=changed["x"], y=changed["y"], p=changed["p"])
+    done = invoke(MODEL, tmp_path / "a.npz", "-o", tmp_path / "out", "--no-video")
+    assert done.exit_code == 0
+    assert "1 unsorted" in done.stderr
+    assert "3 outside the sensor" in done.stderr
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["events_to_note"]["outside_sensor"] == 3
+
+
+def test_after_ctrl_c_what_was_done_is_written(recording, tmp_path, monkeypatch):
+    estimate, calls = Estimator.estimate, []
+
+    def interrupted(self, frame, **options):
+        calls.append(frame)
+        if len(calls) == 6:
+            raise KeyboardInterrupt
+        return estimate(self, frame, **options)
+
+    monkeypatch.setattr(Estimator, "estimate", interrupted)
+    done = invoke(MODEL, recording, "-o", tmp_path)
+    assert done.exit_code == 130
+    assert "interrupted; 5 windows are written" in done.stderr
+    assert len(rows_of(tmp_path)) == 5
+    assert cv2.VideoCapture(str(tmp_path / "overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 5
+    assert not list(tmp_path.glob("*.part*"))
+
+
+def test_without_opencv_one_line_says_what_to_install(recording, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    done = invoke(MODEL, recording)
+    assert done.exit_code == 2
+    assert done.stderr.strip() == "run-model: the package 'cv2' is missing; pip install 'glideproof[recordings]'"
+
+
+def test_a_real_recording_is_estimated(tmp_path):
+    path = RECORDINGS / "ecpy_test1_640x480_evt3.raw"
+    if not path.is_file():
+        pytest.skip(f"{path} is missing; set GLIDEPROOF_RECORDINGS to the folder of the recordings")
+    pytest.importorskip("faery", reason="the extra 'recordings' is not installed")
+    assert invoke(MODEL, path, "-o", tmp_path, "--no-video").exit_code == 0
+    assert len(rows_of(tmp_path)) == 52
+
+
+# --- truth and history ---
+
+
+@pytest.mark.parametrize(
+    "text", ["", "time_us,theta_rad\n1,2\n", "time_us,theta_rad,x_m,y_m,z_m\n", "time_us,theta_rad,x_m,y_m,z_m\n5,0,0,1,1\n4,0,0,1,1\n"]
+)
+@pytest.mark.filterwarnings("ignore:loadtxt")
+def test_an_unusable_truth_is_an_error_that_names_the_file(tmp_path, text):
+    (tmp_path / "t.csv").write_text(text)
+    with pytest.raises(TruthError, match=r"t\.csv: "):
+        Truth.load(tmp_path / "t.csv")
+
+
+def test_between_two_known_states_the_truth_is_interpolated_and_outside_unknown(truth):
+    known = Truth.load(truth)
+    np.testing.assert_allclose(known.at(40_000), (STATES[0] + STATES[1]) / 2)
+    assert known.at(19_999) is None
+    assert known.at(1e9) is None
+
+
+def test_missed_pixels_are_those_without_a_lit_one_nearby(estimator):
+    scene, frame = estimator.scene, runway_image(estimator.scene, STATES[3])
+    rows, columns = np.nonzero(frame)
+    assert missed_pixels(scene, frame, STATES[3], 0) == 0
+    moved = np.roll(frame, 1, axis=1)
+    expected = sum(not moved[row, column] for row, column in zip(rows, columns, strict=True))
+    assert missed_pixels(scene, moved, STATES[3], 0) == expected > 0
+    assert missed_pixels(scene, moved, STATES[3], 1) == 0
+
+
+def test_a_history_keeps_the_hull_of_what_it_joins_in_constant_memory(estimator):
+    history, drawn = History(), np.random.default_rng(0)
+    lower = drawn.uniform(0, 1, (5 * MOST_MOMENTS, 4))
+    for number, low in enumerate(lower):
+        history.add(Moment(number, number + 1, low, low, low + 0.1, None))
+    assert len(history.moments) < MOST_MOMENTS
+    assert history.moments[0].start_us == 0
+    assert history.moments[-1].stop_us == len(lower)
+    for moment in history.moments:
+        part = lower[int(moment.start_us) : int(moment.stop_us)]
+        np.testing.assert_array_equal(moment.lower, part.min(axis=0))
+        np.testing.assert_array_equal(moment.upper, (part + 0.1).max(axis=0))
+    assert draw_history(estimator.scene, history).shape[1:] == (1280, 3)
+    assert draw_history(estimator.scene, History()).shape[1:] == (1280, 3)
+
+
+# --- replay ---
+
+
+def test_a_replay_hands_over_every_event_when_it_is_due(events):
+    part, got = events[events["t"] < 120_000], []
+    begun = time.monotonic()
+    player = replay.Replay(np.array_split(part, 7), 10_000, 2.0)
+    player.run(lambda packet: got.append((time.monotonic() - begun, packet)))
+    np.testing.assert_array_equal(np.concatenate([packet for _, packet in got]), part)
+    for passed_s, packet in got:
+        assert passed_s >= packet["t"].max() / 1e6 / 2.0
+        assert packet["t"].max() - packet["t"].min() < 10_000
+
+
+def test_a_live_estimator_gives_what_the_windows_give(events, estimator):
+    got, stream = [], FrameStream((480, 640), 40_000, 20_000)
+    live = replay.LiveEstimator(estimator, stream, lambda start_us, estimate: got.append((start_us, estimate)))
+    replay.Replay([events], 10_000, 1000.0).run(live.on_events)
+    windows = list(FrameStream((480, 640), 40_000, 20_000).feed(events))
+    assert [start for start, _ in got] == [start for start, _ in windows]
+    for (_, estimate), (_, frame) in zip(got, windows, strict=True):
+        np.testing.assert_array_equal(estimate.filtered, estimator.estimate(frame).filtered)
+    assert "certified" in replay.line_of(*got[0], 1.0)
