@@ -30,7 +30,7 @@ Runs = list[tuple[float, float]]
 PADDING_SIZE = 2**20
 """|K| that marks a place in the tables as padding: more pixels than a window can hold lit."""
 FINEST_SHARE = 2.0**-44
-"""A slice of theta this share of its entry's is not halved again: what is not proved there is refuted or undecidable."""
+"""A slice of theta this share of its entry's, or two steps of float64 wide, is not halved again: what is not proved there is refuted."""
 NEAR_FACES = (2.0**-30, 1 - 2.0**-30)
 """Where between the least and the greatest altitude of a slice states are tried."""
 SEARCH_SHARE = 2.0**-5
@@ -324,7 +324,8 @@ class _EntryProver:
         self.root = Slice(entry, *entry.theta)
         self.markings = self._seen(entry)
         width = self.root.high - self.root.low
-        self.search_width, self.finest_width = SEARCH_SHARE * width, FINEST_SHARE * width
+        step = max(math.ulp(self.root.low), math.ulp(self.root.high))
+        self.search_width, self.finest_width = SEARCH_SHARE * width, max(FINEST_SHARE * width, 2 * step)
 
     def _seen(self, entry: BallEntry) -> list[_Seen]:
         shared: dict[tuple[float, float], Ends] = {}
@@ -404,7 +405,7 @@ class _EntryProver:
     def _seek_lit_outside(self, runs: Runs, part: Slice, row: int, marking: int) -> None:
         """Raises `Refuted` if a state of the slice lights a pixel outside the runs, or if the slice is as narrow as any."""
         width = part.high - part.low
-        if width > self.search_width:
+        if width > max(self.search_width, self.finest_width):
             return
         for state in _states(part):
             point = _point(part.entry, state)
@@ -450,7 +451,7 @@ class _EntryProver:
     def _seek_dark(self, part: Slice, row: int, pixels: list[int]) -> None:
         """Raises `Refuted` if a state of the slice leaves one of the pixels dark, or if the slice is as narrow as any."""
         width = part.high - part.low
-        if width > self.search_width:
+        if width > max(self.search_width, self.finest_width):
             return
         for state in _states(part):
             spans = list(self._columns_seen(_point(part.entry, state), row))

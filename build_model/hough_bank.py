@@ -32,6 +32,8 @@ SCALE_STEP = 2.0**-10
 LINE_COORDINATES = ("theta", "x", "scale", "z")
 HALVINGS, HALVING_ORDER = 12, ("scale", "x", "theta", "z")
 """How often an entry that would pass on any frame is halved, along which coordinates by turns, before the scene is refused."""
+MOST_WEAK = 4096
+"""More weak entries than this in a cell are not halved: the scene asks for more than a bank of sensible size can give."""
 SMALLEST_LEVER_M = 1e-3
 """A marking's distance from the camera's vertical plane counts as at least this when the bins of the scale are sized."""
 
@@ -140,7 +142,7 @@ def cell_bank(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float6
     parts = [_entries(scene, line_boxes(scene, lower, upper), lower, upper, spatial, window)]
     for halving in range(HALVINGS):
         weak = parts[-1].weak(scene.tolerance.missed_budget)
-        if not weak.any() or parts[-1].hopeless(scene.tolerance.missed_budget):
+        if not 0 < weak.sum() <= MOST_WEAK or parts[-1].hopeless(scene.tolerance.missed_budget):
             break
         halves = _halved(parts[-1].lines[weak], HALVING_ORDER[halving % len(HALVING_ORDER)])
         parts[-1:] = [parts[-1][~weak], _entries(scene, halves, lower, upper, spatial, window)]
@@ -187,6 +189,6 @@ def _demand_strong(scene: Scene, entries: _Entries) -> None:
         low, high = entries.states.lower[weak[0]], entries.states.upper[weak[0]]
         where = ", ".join(f"{name} {a:.4g}..{b:.4g}" for name, a, b in zip(STATE_NAMES, low, high, strict=True))
         raise SceneError(
-            f"bank: in {where}, only {entries.must_light[weak[0]].sum()} pixels are lit by all states however finely divided, which does "
-            f"not exceed missed_budget {scene.tolerance.missed_budget}; keep the runway in view there"
+            f"bank: in {where}, only {entries.must_light[weak[0]].sum()} pixels are lit by all states even where divided finely, which does "
+            f"not exceed missed_budget {scene.tolerance.missed_budget}; keep the runway in view there, or lower the budget"
         )

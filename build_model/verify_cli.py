@@ -48,6 +48,8 @@ def verify_model(
 
 def _table(model: Path, report: VerificationReport) -> Table:
     table = Table(title=str(model), show_header=False, title_justify="left")
+    table.add_column()
+    table.add_column(overflow="fold")
     rows = {
         "cells": report.cells,
         "entries": report.entries,

@@ -159,12 +159,9 @@ class Estimator:
             raise ModelError(f"{source}: sha256 is {model.sha256}, the caller trusts {sha256}; take the file from its source again")
         return cls(model, str(source), threads, missed_budget, extra_budget)
 
-    def run(self, frame: NDArray) -> dict[str, Any]:
-        """The model's own outputs for one frame (table in models/README.md). Raises `FrameError` as `estimate` does."""
-        return self._run(self._checked_frame(frame))
-
-    def _run(self, pixels: NDArray[np.uint8]) -> dict[str, Any]:
-        return dict(zip(OUTPUTS, self._session.run(OUTPUTS, {"frame": pixels, **self._budgets}), strict=True))
+    def run(self, frame: NDArray[np.uint8]) -> dict[str, Any]:
+        """The model's own outputs for a frame (table in models/README.md), uint8 (height, width) of {0, 1}, whose values are not checked."""
+        return dict(zip(OUTPUTS, self._session.run(OUTPUTS, {"frame": frame, **self._budgets}), strict=True))
 
     def estimate(self, frame: NDArray, proposal: ArrayLike | None = None, refine: bool = True) -> Estimate:
         """State and certified box of one frame.
@@ -174,7 +171,7 @@ class Estimator:
         `FrameError` for any other frame and ValueError for a proposal of another shape.
         """
         pixels = self._checked_frame(frame)
-        outputs = self._run(pixels)
+        outputs = self.run(pixels)
         cell, support, mismatch, passes, cell_lower, cell_upper, filtered, network_state = outputs.values()
         network = np.where(self._fixed, self._domain_lower, network_state)
         passing = np.flatnonzero(support)

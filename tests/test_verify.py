@@ -653,7 +653,7 @@ def test_command_prints_what_it_proved(files: dict[str, Path]) -> None:
     result = CliRunner().invoke(app, [str(files["paper's shape"]), "--jobs", "1"])
     assert result.exit_code == 0, result.output
     assert "proved" in result.output
-    assert verify_model(files["paper's shape"]).sha256[:32] in result.output
+    assert verify_model(files["paper's shape"]).sha256 in re.sub(r"[^0-9a-z]", "", result.output)
 
 
 def test_command_exits_1_with_the_counterexample(model: Model, tmp_path: Path) -> None:
