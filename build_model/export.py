@@ -209,6 +209,9 @@ def user_network(scene: Scene, path: Path) -> onnx.GraphProto:
         raise EstimatorError(f"{path}: found {found}; expected {expected}")
     if any(domain.domain not in ("", "ai.onnx") for domain in model.opset_import) or model.functions:
         raise EstimatorError(f"{path}: found operators or functions of its own; expected standard operators only")
+    branching = sorted({node.op_type for node in graph.node if any(part.HasField("g") or part.graphs for part in node.attribute)})
+    if branching:
+        raise EstimatorError(f"{path}: found control flow ({', '.join(branching)}); expected a graph that is the same for every frame")
     return graph
 
 

@@ -189,6 +189,6 @@ def _demand_strong(scene: Scene, entries: _Entries) -> None:
         low, high = entries.states.lower[weak[0]], entries.states.upper[weak[0]]
         where = ", ".join(f"{name} {a:.4g}..{b:.4g}" for name, a, b in zip(STATE_NAMES, low, high, strict=True))
         raise SceneError(
-            f"bank: in {where}, only {entries.must_light[weak[0]].sum()} pixels are lit by all states even where divided finely, which does "
+            f"bank: in {where}, only {entries.must_light[weak[0]].sum()} pixels are lit by all states of a small part, which does "
             f"not exceed missed_budget {scene.tolerance.missed_budget}; keep the runway in view there, or lower the budget"
         )

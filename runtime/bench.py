@@ -71,7 +71,7 @@ def methods(estimator: Estimator) -> dict[str, Method]:
     cv2.setNumThreads(1)
     segments = cv2.createLineSegmentDetector()
     return {
-        "session.run": estimator.run,
+        "session.run": estimator.run_unchecked,
         "estimate, no refinement": lambda frame: estimator.estimate(frame, refine=False),
         "estimate": estimator.estimate,
         REFERENCE: lambda image: cv2.HoughLinesP(image, 1, np.pi / 180, 20, minLineLength=20, maxLineGap=3),

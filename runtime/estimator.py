@@ -159,9 +159,13 @@ class Estimator:
             raise ModelError(f"{source}: sha256 is {model.sha256}, the caller trusts {sha256}; take the file from its source again")
         return cls(model, str(source), threads, missed_budget, extra_budget)
 
-    def run(self, frame: NDArray[np.uint8]) -> dict[str, Any]:
-        """The model's own outputs for a frame (table in models/README.md), uint8 (height, width) of {0, 1}, whose values are not checked."""
-        return dict(zip(OUTPUTS, self._session.run(OUTPUTS, {"frame": frame, **self._budgets}), strict=True))
+    def run(self, frame: NDArray) -> dict[str, Any]:
+        """The model's own outputs for one frame (table in models/README.md). Raises `FrameError` as `estimate` does."""
+        return self.run_unchecked(self._checked_frame(frame))
+
+    def run_unchecked(self, pixels: NDArray[np.uint8]) -> dict[str, Any]:
+        """`run` for a frame that is known to be uint8 (height, width) of {0, 1}: one call of onnxruntime."""
+        return dict(zip(OUTPUTS, self._session.run(OUTPUTS, {"frame": pixels, **self._budgets}), strict=True))
 
     def estimate(self, frame: NDArray, proposal: ArrayLike | None = None, refine: bool = True) -> Estimate:
         """State and certified box of one frame.
@@ -171,7 +175,7 @@ class Estimator:
         `FrameError` for any other frame and ValueError for a proposal of another shape.
         """
         pixels = self._checked_frame(frame)
-        outputs = self.run(pixels)
+        outputs = self.run_unchecked(pixels)
         cell, support, mismatch, passes, cell_lower, cell_upper, filtered, network_state = outputs.values()
         network = np.where(self._fixed, self._domain_lower, network_state)
         passing = np.flatnonzero(support)
@@ -195,19 +199,20 @@ class Estimator:
             touches_boundary=box is not None and self._touches_boundary(box),
         )
 
-    def estimate_many(self, frames: Iterable[NDArray], refine: bool = True, workers: int = 2) -> Iterator[Estimate]:
+    def estimate_many(self, frames: Iterable[NDArray], refine: bool = True, processes: int = 2) -> Iterator[Estimate]:
         """`estimate` of every frame, in order, on several cores: the same answers to the last bit.
 
-        Frames are taken a few ahead of the answers. Refinement needs processes, which read the model's file again and take about as long
-        to start as 100 frames; a script then needs the usual `if __name__ == "__main__":`. Raises `FrameError` when it comes to a frame
-        that the model cannot take, and from processes `ModelError` if the file has changed.
+        Frames are taken a few ahead of the answers. Without refinement, `processes` threads do the work. With it, processes do, which
+        read the model's file again and take about as long to start as 100 frames; a script then needs the usual
+        `if __name__ == "__main__":`. Raises `FrameError` when it comes to a frame that the model cannot take, and `BrokenProcessPool`
+        if the file has gone or changed.
         """
         from runtime.batch import by_processes, by_threads  # loads 3 MB that other programs can do without
 
         pixels = map(self._checked_frame, frames)
         if refine:
-            return by_processes(self._arguments, self.scene.camera.width, pixels, workers)
-        return by_threads(self, pixels, workers)
+            return by_processes(self._arguments, self.scene.camera.width, pixels, processes)
+        return by_threads(self, pixels, processes)
 
     def spatial_mask(self, cell: int) -> NDArray[np.bool_]:
         """S of a cell, (height, width): every pixel that one of its states can light, widened by the tolerance."""

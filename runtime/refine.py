@@ -88,7 +88,7 @@ class Refiner:
         self._by_altitude(sets)
         low = np.concatenate([offset[0].T, [sets.x[:, 0], sets.y[:, 0], sets.z[:, 0], sets.scale[:, 0]]])
         high = np.concatenate([offset[1].T, [sets.x[:, 1], sets.y[:, 1], sets.z[:, 1], sets.scale[:, 1]]])
-        return sets[~inverted(low, high).any(axis=0)]
+        return sets[~np.logical_or.reduce(inverted(low, high), axis=0)]
 
     def _by_altitude(self, sets: StateSet) -> None:
         """Draws y and scale in by y = F s(theta, t_ref) / scale."""
@@ -148,8 +148,8 @@ class Refiner:
         found = claimed.last >= claimed.first
         whole = np.zeros_like(found)
         whole[..., 1:-1] = grid.crossed[..., :-1] & grid.crossed[..., 1:] & found[..., 1:-1]
-        rises = (self.scene.runway.x_m[:, None] >= sets.x[:, None, ::-1]).all(axis=-1)[..., None]
-        falls = (self.scene.runway.x_m[:, None] <= sets.x[:, None, ::-1]).all(axis=-1)[..., None]
+        across = self.scene.runway.x_m[:, None] - sets.x[:, None, ::-1]
+        rises, falls = across[..., :1] >= 0, across[..., 1:] <= 0
         ratios = [ratio[:, None, :] for ratio in grid.ratio]
         high = claimed.first + 1 - self.scene.camera.u0 + OUTWARD_PX
         low = claimed.last - self.scene.camera.u0 - OUTWARD_PX

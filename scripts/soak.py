@@ -109,9 +109,11 @@ def main(
             number, size = map(int, line.split())
             resident.append(size)
             console.print(f"frame {number:>9,}: resident {size / MB:.2f} MB", highlight=False)
-    growth = (resident[-1] - resident[0]) / MB if resident else 0.0
+    if loop.returncode:
+        sys.exit(f"the loop ended early, with exit code {loop.returncode}")
+    growth = (resident[-1] - resident[0]) / MB
     console.print(f"start to end: {growth:+.2f} MB", highlight=False)
-    if loop.returncode or growth > allowed_mb:
+    if growth > allowed_mb:
         sys.exit(1)
 
 

@@ -55,8 +55,9 @@ def model_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     folder.mkdir(exist_ok=True)
 
     def model(name: str) -> Path:
-        from build_model.export import export_model
         from scenes import SCENES
+
+        from build_model.export import export_model
 
         path = folder / f"{name.replace(', ', '-').replace(' ', '-')}.onnx"
         with path.with_suffix(".lock").open("w") as lock:

@@ -42,7 +42,9 @@ CUT_LEFT, CUT_RIGHT, CUT_BELOW = seen_from(PAPER, 25.0, 240.0), seen_from(PAPER,
 FREE_X = replace(
     PAPER,
     camera=Camera(width=320, height=240, focal_length_m=0.008, pixel_pitch_m=30e-6),
-    domain=Domain(Axis((0.55, 0.6, 0.65), 0.05), Axis((-0.04, 0.0, 0.04), 0.04), Axis((0.85, 0.9, 0.95), 0.05), Axis((1.65, 1.7, 1.75), 0.05)),
+    domain=Domain(
+        Axis((0.55, 0.6, 0.65), 0.05), Axis((-0.04, 0.0, 0.04), 0.04), Axis((0.85, 0.9, 0.95), 0.05), Axis((1.65, 1.7, 1.75), 0.05)
+    ),
     bank=Bank(pitch_bins=2, distance_bins=1, column_px=0.35, lateral_px=0.35),
 )
 """81 cells, three of them along x."""

@@ -57,13 +57,13 @@ def test_an_endless_stream_is_taken_only_a_few_frames_ahead(estimator: Estimator
             taken.append(number)
             yield frames[number % len(frames)]
 
-    estimates = estimator.estimate_many(endless(), refine=False, workers=2)
+    estimates = estimator.estimate_many(endless(), refine=False, processes=2)
     first = list(itertools.islice(estimates, 3))
     assert same(first[2], estimator.estimate(frames[2], refine=False))
     assert len(taken) == 5 * CHUNK
 
 
 def test_a_frame_that_does_not_fit_is_an_error_when_its_turn_comes(estimator: Estimator, frames: list[NDArray[np.uint8]]) -> None:
-    estimates = estimator.estimate_many([*frames[:CHUNK], frames[0][1:]], refine=False, workers=1)
+    estimates = estimator.estimate_many([*frames[:CHUNK], frames[0][1:]], refine=False, processes=1)
     with pytest.raises(FrameError, match=r"found \(479, 640\) of uint8"):
         list(estimates)

@@ -45,8 +45,6 @@ def border(window: Window, count: int = 9) -> Floats:
     return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2)
 
 
-
-
 @given(
     roll=st.floats(0, 0.2),
     yaw=st.floats(0, 0.2),

@@ -9,7 +9,7 @@ import resource
 import signal
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from onnx import TensorProto, helper, numpy_helper
 from scenes import OFF_BY, ONE_CELL, PAPER, SCENES
 
 from build_model.export import EstimatorError, assumptions, export_model, user_network, write_atomically
+from build_model.partition import partition
 from build_model.reachability import paper_bound
 from runtime import Estimator
 from runtime.image import runway_image
@@ -67,9 +68,9 @@ def test_metadata_say_what_the_model_is(model_of: ModelOf) -> None:
     assert set(metadata["versions"]) == {"python", "glideproof", "numpy", "onnx", "onnxruntime", "torch"}
     sizes = next(numpy_helper.to_array(tensor) for tensor in model.graph.initializer if tensor.name == "must_light_size")
     assert metadata["smallest_must_light"] == sizes.min()
-    bound = paper_bound(scene, scene.domain.lower, scene.domain.lower + [0.1, 0, 0.1, 0.1])
-    assert len(metadata["paper_bounds"]) == 27
-    assert bound is None or set(metadata["paper_bounds"][0]) == set(vars(bound))
+    cells = partition(scene)
+    bounds = [paper_bound(scene, lower, upper) for lower, upper in zip(cells.lower, cells.upper, strict=True)]
+    assert metadata["paper_bounds"] == [None if bound is None else asdict(bound) for bound in bounds]
 
 
 def test_no_name_of_the_machine_is_in_the_file(model_of: ModelOf) -> None:
@@ -272,7 +273,9 @@ def test_operators_that_are_not_standard_are_refused(tmp_path: Path) -> None:
 
 def test_control_flow_is_refused(tmp_path: Path) -> None:
     """A model has none: it would no longer be static."""
-    branch = helper.make_graph([helper.make_node("Identity", ["ones"], ["chosen"])], "b", [], [helper.make_tensor_value_info("chosen", *STATE)])
+    branch = helper.make_graph(
+        [helper.make_node("Identity", ["ones"], ["chosen"])], "b", [], [helper.make_tensor_value_info("chosen", *STATE)]
+    )
     nodes = [
         helper.make_node("ReduceMax", ["image"], ["largest"], keepdims=0),
         helper.make_node("Cast", ["largest"], ["lit"], to=TensorProto.BOOL),
@@ -288,7 +291,11 @@ def test_control_flow_is_refused(tmp_path: Path) -> None:
 def test_files_that_are_no_network_are_refused(tmp_path: Path) -> None:
     (tmp_path / "text.onnx").write_text("no network")
     (tmp_path / "empty.onnx").write_bytes(b"")
-    for name, message in (("missing.onnx", r"cannot be read \(No such file"), ("text.onnx", "not a usable"), ("empty.onnx", "not a usable")):
+    for name, message in (
+        ("missing.onnx", r"cannot be read \(No such file"),
+        ("text.onnx", "not a usable"),
+        ("empty.onnx", "not a usable"),
+    ):
         with pytest.raises(EstimatorError, match=rf"{name}: {message}"):
             user_network(ONE_CELL, tmp_path / name)
 
@@ -296,7 +303,11 @@ def test_files_that_are_no_network_are_refused(tmp_path: Path) -> None:
 def test_weights_in_another_file_are_refused(tmp_path: Path) -> None:
     """The model is one file; weights beside the user's network would be left behind."""
     onnx.save(
-        network({"image": IMAGE}, {"state": STATE}), tmp_path / "user.onnx", save_as_external_data=True, location="weights", size_threshold=0
+        network({"image": IMAGE}, {"state": STATE}),
+        tmp_path / "user.onnx",
+        save_as_external_data=True,
+        location="weights",
+        size_threshold=0,
     )
     assert (tmp_path / "weights").exists()
     with pytest.raises(EstimatorError):

@@ -124,7 +124,8 @@ def test_a_set_far_from_the_frame_is_dropped() -> None:
     """Tightness: nothing is left of a small set when the frame shows a state a tenth away, or nothing at all."""
     lower, upper = PAPER.domain.lower, PAPER.domain.upper
     state = (lower + upper) / 2
-    sides = np.stack([state - [0.01, 0, 0.01, 0.01], state + [0.01, 0, 0.01, 0.01]], axis=-1)[:, None]
+    around = np.array([0.01, 0, 0.01, 0.01])
+    sides = np.stack([state - around, state + around], axis=-1)[:, None]
     sets = StateSet(*sides, np.array([[1.0, 1000.0]]), np.array([0.0]))
     refiner = Refiner(PAPER, 0, -1)
     assert len(refiner.refine(np.zeros((480, 640), dtype=bool), sets)) == 0

@@ -136,9 +136,7 @@ def test_missed_pixels_in_the_worst_places(estimator_of: EstimatorOf, name: str,
 
 @settings(max_examples=25)
 @given(data=st.data(), missed=st.integers(1, 20), place=st.sampled_from(PLACES), seed=st.integers(0, 1000))
-def test_missed_pixels_that_hypothesis_finds(
-    estimator_of: EstimatorOf, data: st.DataObject, missed: int, place: str, seed: int
-) -> None:
+def test_missed_pixels_that_hypothesis_finds(estimator_of: EstimatorOf, data: st.DataObject, missed: int, place: str, seed: int) -> None:
     estimator = estimator_of("paper", missed)
     state = data.draw(states_of(estimator.scene))
     seen = missing(estimator.scene, state, runway_image(estimator.scene, state), missed, place, seed)

@@ -1,0 +1,163 @@
+"""The command export-model, as users start it: what it prints, its exit codes, and one line for every error."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from runtime import Estimator
+
+COMMAND = "from build_model.cli import export_model_command; export_model_command()"
+Run = Callable[..., subprocess.CompletedProcess]
+
+ONE_CELL = """
+[camera]
+width = 640
+height = 480
+focal_length_m = 0.008
+pixel_pitch_m = 15e-6
+
+[[runway.markings]]
+name = "L"
+x_m = -0.1
+start_z_m = 0.0
+length_m = 0.3
+
+[[runway.markings]]
+name = "R"
+x_m = 0.1
+start_z_m = 0.0
+length_m = 0.3
+
+[domain]
+theta_rad = { centres = [0.6], width = 0.1 }
+x_m = { centres = [0.0], width = 0.0 }
+y_m = { centres = [0.9], width = 0.1 }
+z_m = { centres = [1.7], width = 0.1 }
+
+[bank]
+pitch_bins = 4
+distance_bins = 2
+column_px = 0.35
+
+[estimator]
+training_frames = 256
+epochs = 1
+"""
+
+
+@pytest.fixture
+def scene_file(tmp_path: Path) -> Path:
+    path = tmp_path / "field.toml"
+    path.write_text(ONE_CELL)
+    return path
+
+
+@pytest.fixture
+def run(tmp_path: Path, repository: Path) -> Run:
+    """Runs the command in a folder of its own, as a process of its own."""
+
+    def started(*arguments: object, code: str = COMMAND) -> subprocess.CompletedProcess:
+        command = [sys.executable, "-c", code, *map(str, arguments)]
+        environment = {"PATH": "", "PYTHONPATH": str(repository), "HOME": str(tmp_path), "OMP_NUM_THREADS": "1", "COLUMNS": "140"}
+        return subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=False)
+
+    return started
+
+
+def models_in(folder: Path) -> set[str]:
+    """Names of all models, whole and half-written."""
+    return {path.name for pattern in ("*.onnx", "*.part") for path in folder.rglob(pattern)}
+
+
+def fails_with(result: subprocess.CompletedProcess, *parts: str, code: int = 2) -> None:
+    """One line on stderr that holds all parts, and no traceback."""
+    assert result.returncode == code, result.stderr
+    assert result.stderr.count("\n") == 1
+    for part in parts:
+        assert part in result.stderr
+    assert "Traceback" not in result.stdout + result.stderr
+
+
+def test_a_scene_becomes_a_model_with_a_summary(run: Run, scene_file: Path, tmp_path: Path) -> None:
+    """Beside the summary: progress of every stage with its loss, NN_e's errors and the certificate's assumptions; then again, the same."""
+    result = run(scene_file.name, "--seed", 3, "--jobs", 1)
+    assert result.returncode == 0, result.stderr
+    assert result.stderr == ""
+    model = tmp_path / "out" / "field.onnx"
+    estimator = Estimator.load(model)
+    for text in ("cells", "entries", "smallest |K| - m", "S, pixels a cell", "NN_F, seconds", "NN_e, seconds", "MB", estimator.sha256):
+        assert text in result.stdout
+    for text in ("training NN_e", "loss 0.", "frames for NN_e", "The certificate assumes:", "At most 0 pixels of the runway's image"):
+        assert text in result.stdout
+    again = run(scene_file.name, "-o", "again.onnx", "--seed", 3)
+    assert again.returncode == 0
+    assert (tmp_path / "again.onnx").read_bytes() == model.read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "parts"),
+    [
+        ("width = 640", "widht = 640", ("field.toml: camera.widht: found an unknown key", "known here")),
+        ("[bank]", "[bank", ("field.toml: not TOML",)),
+        ("[estimator]", "[tolerance]\nmissed_budget = 100\n[estimator]", ("bank: in theta 0.55", "missed_budget 100")),
+        ("[estimator]", "[calibration]\nprincipal_px = 0.4\n[estimator]", ("tolerance.line_px: found 0", "give 1 or more")),
+        ("pixel_pitch_m = 15e-6", "pixel_pitch_m = 15e-6\nprincipal_point = [320.0, 3000.0]", ("only 0 pixels", "keep the runway in view")),
+    ],
+)
+def test_a_bad_scene_is_one_line(run: Run, scene_file: Path, tmp_path: Path, old: str, new: str, parts: tuple[str, ...]) -> None:
+    assert old in ONE_CELL
+    scene_file.write_text(ONE_CELL.replace(old, new))
+    fails_with(run(scene_file.name), *parts)
+    assert models_in(tmp_path) == set()
+
+
+def test_missing_files_are_one_line(run: Run, scene_file: Path, tmp_path: Path) -> None:
+    fails_with(run("nowhere.toml"), "nowhere.toml: cannot be read", "give the path of a TOML scene file")
+    fails_with(run(scene_file.name, "--estimator", "nowhere.onnx"), "nowhere.onnx: cannot be read", "give the path of an ONNX file")
+    fails_with(run(scene_file.name, "--estimator", scene_file.name), "field.toml: not a usable ONNX model")
+    fails_with(run(scene_file.name, "-o", "field.toml/model.onnx"), "model.onnx: cannot be written (Not a directory)")
+    assert scene_file.read_text() == ONE_CELL
+    assert models_in(tmp_path) == set()
+
+
+def test_a_full_disk_leaves_the_old_model(run: Run, scene_file: Path, tmp_path: Path) -> None:
+    """The system's limit on the size of a file stands for the disk."""
+    (tmp_path / "model.onnx").write_bytes(b"old")
+    limited = textwrap.dedent(f"""
+        import resource, signal
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000))
+        {COMMAND}
+    """)
+    result = run(scene_file.name, "-o", "model.onnx", "--jobs", 1, code=limited)
+    fails_with(result, "model.onnx: cannot be written (File too large)", "the model that was there before is untouched")
+    assert (tmp_path / "model.onnx").read_bytes() == b"old"
+    assert models_in(tmp_path) == {"model.onnx"}
+
+
+def test_ctrl_c_leaves_the_old_model(run: Run, scene_file: Path, tmp_path: Path) -> None:
+    """A real SIGINT while NN_e is trained for far longer than the test waits: exit code 130, one line."""
+    (tmp_path / "model.onnx").write_bytes(b"old")
+    scene_file.write_text(ONE_CELL.replace("training_frames = 256", "training_frames = 10_000_000"))
+    interrupted = textwrap.dedent(f"""
+        import build_model.export, os, signal, threading
+        threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT)).start()
+        {COMMAND}
+    """)
+    result = run(scene_file.name, "-o", "model.onnx", "--jobs", 1, code=interrupted)
+    fails_with(result, "model.onnx: interrupted; the model that was there before is untouched", code=130)
+    assert (tmp_path / "model.onnx").read_bytes() == b"old"
+    assert models_in(tmp_path) == {"model.onnx"}
+
+
+def test_help_names_every_option(run: Run) -> None:
+    result = run("--help")
+    assert result.returncode == 0
+    for option in ("--output", "-o", "--estimator", "--seed", "--jobs"):
+        assert option in result.stdout
