@@ -10,6 +10,7 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+import h5py  # noqa: F401  imported before codac, whose own copy of HDF5 makes a later import of h5py crash
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, settings

@@ -142,12 +142,15 @@ def test_a_full_disk_leaves_the_old_model(run: Run, scene_file: Path, tmp_path: 
 
 
 def test_ctrl_c_leaves_the_old_model(run: Run, scene_file: Path, tmp_path: Path) -> None:
-    """A real SIGINT while NN_e is trained for far longer than the test waits: exit code 130, one line."""
+    """A real SIGINT while frames are made for far longer than the test waits: exit code 130, one line.
+
+    What torch imports late is imported first: an interrupted import ends in an error of torch's own.
+    """
     (tmp_path / "model.onnx").write_bytes(b"old")
     scene_file.write_text(ONE_CELL.replace("training_frames = 256", "training_frames = 10_000_000"))
     interrupted = textwrap.dedent(f"""
-        import build_model.export, os, signal, threading
-        threading.Timer(1.0, os.kill, (os.getpid(), signal.SIGINT)).start()
+        import build_model.export, os, signal, threading, torch._dynamo
+        threading.Timer(2.0, os.kill, (os.getpid(), signal.SIGINT)).start()
         {COMMAND}
     """)
     result = run(scene_file.name, "-o", "model.onnx", "--jobs", 1, code=interrupted)
