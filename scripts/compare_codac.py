@@ -25,10 +25,13 @@ drives the search. Times are processor times of one thread; on a busy machine on
 
 from __future__ import annotations
 
+import ctypes
+import ctypes.util
 import importlib
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -45,7 +48,23 @@ from runtime import Estimator, ModelError, Scene
 from runtime.image import lit_columns
 from runtime.rounding import above, below
 
-codac: Any = importlib.import_module("codac")
+
+@contextmanager
+def rounding_mode_kept() -> Iterator[None]:
+    """Gives the thread its rounding mode back: codac leaves the processor rounding upward, on import and after interval functions.
+
+    All float64 arithmetic of the process would round upward from then on, ours and numpy's included.
+    """
+    libm = ctypes.CDLL(ctypes.util.find_library("m"))
+    mode = libm.fegetround()
+    try:
+        yield
+    finally:
+        libm.fesetround(mode)
+
+
+with rounding_mode_kept():
+    codac: Any = importlib.import_module("codac")
 """Imported by name: codac comes without the stubs that type checkers need."""
 IntervalVector = Any
 """A codac.IntervalVector."""
@@ -162,6 +181,7 @@ class Inversion:
 class SetInversion:
     """Encloses the states of a scene's domain whose image lies within a frame, with codac's intervals and contractors."""
 
+    @rounding_mode_kept()
     def __init__(self, scene: Scene) -> None:
         if scene.domain.lower[1] != scene.domain.upper[1] or scene.tolerance.line_px or scene.tolerance.missed_budget:
             raise ValueError("scene: found a free x axis or a tolerance; this comparison needs x fixed, line_px 0 and missed_budget 0")
@@ -172,6 +192,7 @@ class SetInversion:
         across, ends = scene.runway.x_m - scene.domain.lower[1], scene.runway.ends_z_m
         self._stripes = [(self._ends(pair), across[(ends == pair).all(axis=1)]) for pair in np.unique(ends, axis=0)]
 
+    @rounding_mode_kept()
     def invert(self, frame: NDArray, precision: Floats) -> Inversion:
         """The hull of what a frame allows in the whole domain. `precision`: (3,), rad, m, m."""
         start = time.thread_time()

@@ -129,6 +129,13 @@ def test_codac_and_we_enclose_the_same_states(estimator: Estimator, clutter: flo
     assert all(result.codac.outer.holds(compare_codac.Hull(state, state)) for state in inside)
 
 
+def test_codac_leaves_the_processor_rounding_to_nearest(paper_scene: Scene) -> None:
+    compare_codac.SetInversion(paper_scene).invert(runway_image(paper_scene, [0.6, 0.0, 0.9, 1.7]), PRECISION)
+    tiny = 2.0**-60
+    assert 1.0 + np.float64(tiny) == 1.0
+    assert -1.0 - np.float64(tiny) == -1.0
+
+
 def test_codac_finds_nothing_in_a_dark_frame_and_all_in_a_lit_one(paper_scene: Scene) -> None:
     inversion = compare_codac.SetInversion(paper_scene)
     dark = np.zeros(paper_scene.camera.shape, dtype=np.uint8)

@@ -157,8 +157,10 @@ def test_a_full_disk_during_an_export_leaves_the_old_model(tmp_path: Path, model
 
 
 @pytest.mark.parametrize("stage", ["cells", "frames for NN_e", "training NN_e"])
-def test_an_interrupt_leaves_the_old_model(tmp_path: Path, model_of: ModelOf, stage: str) -> None:
-    """A real SIGINT, in each stage."""
+def test_an_interrupt_leaves_the_old_model(tmp_path: Path, model_of: ModelOf, stage: str, request: pytest.FixtureRequest) -> None:
+    """A real SIGINT, in each stage; the handler is set since a background job of a shell ignores the signal."""
+    earlier = signal.signal(signal.SIGINT, signal.default_int_handler)
+    request.addfinalizer(lambda: signal.signal(signal.SIGINT, earlier))
     path = tmp_path / "model.onnx"
     path.write_bytes(model_of("one cell").read_bytes())
 
