@@ -36,7 +36,7 @@ from build_model.hough_bank import CellBank, cell_bank
 from build_model.partition import partition
 from build_model.reachability import paper_bound
 from build_model.state_network import TrainingReport, state_graph, train_state_network
-from runtime.model_file import FORMAT_VERSION, METADATA_KEY
+from runtime.model_file import FORMAT_VERSION, METADATA_KEY, metadata_digest
 from runtime.rounding import OUTWARD_PX
 from runtime.scene import Scene
 
@@ -283,9 +283,10 @@ def assumptions(scene: Scene) -> list[str]:
 
 
 def _serialised(graph: onnx.GraphProto, metadata: dict[str, Any]) -> bytes:
-    """The model file: graph, versions and metadata, checked by onnx."""
+    """The model file: graph, versions and metadata with their digest, checked by onnx."""
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, producer_name="glideproof")
-    helper.set_model_props(model, {METADATA_KEY: json.dumps(metadata, sort_keys=True)})
+    signed = {**metadata, "metadata_sha256": metadata_digest(metadata)}
+    helper.set_model_props(model, {METADATA_KEY: json.dumps(signed, sort_keys=True)})
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString(deterministic=True)
 

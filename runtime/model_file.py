@@ -31,7 +31,7 @@ class ModelError(ValueError):
 
 @dataclass(frozen=True)
 class ModelFile:
-    """The bytes of a model with its metadata; exists only if the graph's digest is the one that the metadata states."""
+    """The bytes of a model with its metadata; exists only if graph and metadata have the digests that the metadata state."""
 
     content: bytes
     metadata: dict[str, Any]
@@ -59,7 +59,15 @@ def parse_model(content: bytes, name: str, wanted: Sequence[str] = ()) -> ModelF
     digest = hashlib.sha256(graph).hexdigest()
     if metadata.get("graph_sha256") != digest:
         raise ModelError(f"{name}: damaged: its graph has sha256 {digest[:16]}..., its metadata say otherwise; get it again")
+    if metadata.get("metadata_sha256") != metadata_digest(metadata):
+        raise ModelError(f"{name}: damaged: its metadata do not have the sha256 that they state; get it again")
     return ModelFile(content, metadata, _tensors(graph, name, wanted))
+
+
+def metadata_digest(metadata: dict[str, Any]) -> str:
+    """sha256 of the metadata as JSON with sorted keys, but for `metadata_sha256`, which holds it."""
+    others = {key: value for key, value in metadata.items() if key != "metadata_sha256"}
+    return hashlib.sha256(json.dumps(others, sort_keys=True).encode()).hexdigest()
 
 
 def _tensors(graph: memoryview, name: str, wanted: Sequence[str]) -> dict[str, NDArray[Any]]:

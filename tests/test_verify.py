@@ -34,7 +34,7 @@ from build_model.verify import axis_borders, cell_boxes, cell_claims, check_outp
 from build_model.verify_cli import REFUTED, app
 from runtime.camera import ground_scale, project, project_points
 from runtime.image import runway_image
-from runtime.model_file import METADATA_KEY, ModelError
+from runtime.model_file import METADATA_KEY, ModelError, metadata_digest
 from runtime.scene import Axis, Bank, Calibration, Camera, Domain, Marking, Runway, Scene, Tolerance
 
 SCENE = Scene(
@@ -94,9 +94,10 @@ class Model:
         self.set_tables(assemble(self.scene, self.banks))
 
     def save(self, path: Path) -> Path:
-        """Writes the file with its checksum recomputed."""
+        """Writes the file with its checksums recomputed."""
         graph = self.proto.graph
         self.metadata["graph_sha256"] = hashlib.sha256(graph.SerializeToString(deterministic=True)).hexdigest()
+        self.metadata["metadata_sha256"] = metadata_digest(self.metadata)
         helper.set_model_props(self.proto, {METADATA_KEY: json.dumps(self.metadata, sort_keys=True)})
         path.write_bytes(self.proto.SerializeToString(deterministic=True))
         return path
