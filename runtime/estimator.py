@@ -28,6 +28,8 @@ from runtime.state_set import StateSet, tangent_of_row
 PACKAGED_MODELS = (Path(__file__).parent / "models", Path(__file__).parents[1] / "models")
 """Where the paper's model lies: in a wheel beside this file, in a checkout at the top."""
 LOG_ERRORS_ONLY = 3
+REFINED_BEYOND_PX = 2
+"""How far beyond the spatial masks the refinement looks at pixels; those farther out it takes for lit."""
 OUTPUTS = ("cell", "support", "mismatch", "passes", "cell_lower", "cell_upper", "filtered", "network_state")
 BOX_TENSORS = ("state_lower", "state_upper", "line_lower", "line_upper", "reference_row")
 MASK_TENSORS = ("spatial_run_cell", "spatial_run_index", "spatial_run_step", "window_first", "window_stop")
@@ -131,7 +133,8 @@ class Estimator:
         self._domain_lower, self._domain_upper = self.scene.domain.lower, self.scene.domain.upper
         self._fixed = self._domain_lower == self._domain_upper
         self._entries = _Entries.of(self.scene, model.tensors)
-        self._refiner = Refiner(self.scene, int(self._budgets["missed_budget"]), int(self._budgets["extra_budget"]))
+        window = self._entries.window_and_beyond(REFINED_BEYOND_PX)
+        self._refiner = Refiner(self.scene, int(self._budgets["missed_budget"]), int(self._budgets["extra_budget"]), window)
         self._arguments = {"path": name, "missed_budget": missed_budget, "extra_budget": extra_budget, "sha256": model.sha256}
 
     @classmethod
@@ -235,6 +238,8 @@ class Estimator:
     def _witnesses(self, frame: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Lit where a lit pixel lies within `line_px` in the sup norm, or the frame ends: what belongs there may be seen outside of it."""
         radius = self.scene.tolerance.line_px
+        if radius == 0:
+            return frame
         wide = dilated(np.pad(frame, radius, constant_values=True), radius)
         return wide[radius : radius + len(frame), radius : radius + frame.shape[1]]
 
@@ -335,6 +340,11 @@ class _Entries:
     def sets(self, passes: NDArray[np.bool_]) -> StateSet:
         """The entries that pass; `passes` is (cells, entries)."""
         return self.all[np.flatnonzero(passes)]
+
+    def window_and_beyond(self, margin_px: int) -> tuple[slice, slice]:
+        """The masks' window with a margin; a slice need not stop at the frame's border."""
+        rows, columns = (slice(max(side.start - margin_px, 0), side.stop + margin_px) for side in self.window)
+        return rows, columns
 
     def within(self, cell: int, frame: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """The frame within the cell's spatial mask S."""

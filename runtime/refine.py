@@ -20,21 +20,26 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runtime.rounding import OUTWARD_PX, above, below, inverted
 from runtime.scene import Scene
-from runtime.state_set import Floats, StateSet, column_range, end_rows, reference_fall_range, scale_ratio, tangent_of_row
+from runtime.state_set import Floats, StateSet, end_rows, reference_fall_range, scale_ratio, tangent_of_row
 
 Bits = NDArray[np.bool_]
 Rows = NDArray[np.int64]
+Interval = tuple[Floats, Floats]
+"""Lower and upper bounds."""
 
 CUTS = (2, 4)
 """Slices of theta that every piece is cut into, round after round."""
-FACE_ROUNDS, FACE_PIECES, FACE_CUTS = 2, 2, (4, 3)
-"""Last rounds: how many, how many pieces a face of the box, and into how many slices of theta and of z each is cut."""
+FACE_PIECES, FACE_CUTS = 2, (4, 3)
+"""Then the pieces that carry a face of the box are cut: how many a face, and into how many slices of theta and of z each."""
+FACE_ROUNDS, FACE_GAIN = 6, 0.05
+"""At most so many times, and until a round takes less than this share from every side of the box."""
 LARGEST_START = 512
 """More passing entries than this say that the frame tells next to nothing: they are left as they are, at a bounded cost."""
 MOST_TO_JOIN = 1024
@@ -45,6 +50,8 @@ NO_BOUND = 2.0**40
 """Stands for an infinite bound on a column or an offset, px."""
 NO_ROW = 2**20
 """Stands for a row that no frame has."""
+NO_COLUMN = np.int16(2**15 - 1)
+"""Stands for a column that no frame has."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +61,8 @@ class Refiner:
     scene: Scene
     missed_budget: int
     extra_budget: int
+    window: tuple[slice, slice] = (slice(None), slice(None))
+    """Rows and columns outside of which pixels count as lit, whatever the frame shows there."""
 
     def refine(self, frame: Bits, entries: StateSet, claimed: Bits | None = None) -> StateSet:
         """Slices that hold all states of `entries` which are consistent with `frame`, (height, width); none if there is none.
@@ -62,32 +71,36 @@ class Refiner:
         """
         if len(entries) > LARGEST_START:
             return entries
-        canvas = np.pad(frame, 1, constant_values=True)
-        claims = None if claimed is None else np.pad(claimed, 1)
+        witnesses = _Pixels.of(frame, self.window, beyond=True)
+        claims = None if claimed is None else _Pixels.of(claimed, self.window, beyond=False)
         pieces = entries
         for cuts in CUTS:
-            pieces = self._contracted(canvas, claims, _cut(pieces, theta=cuts))
+            pieces = self._contracted(witnesses, claims, _cut(pieces, theta=cuts))
+        extent = _extent(pieces)
         for _ in range(FACE_ROUNDS):
             outer = _carries_a_face(pieces, FACE_PIECES)
-            finer = self._contracted(canvas, claims, _cut(pieces[outer], theta=FACE_CUTS[0], z=FACE_CUTS[1]))
-            pieces = joined(finer, pieces[~outer])
+            finer = self._contracted(witnesses, claims, _cut(pieces[outer], theta=FACE_CUTS[0], z=FACE_CUTS[1]))
+            pieces, before = joined(finer, pieces[~outer]), extent
+            extent = _extent(pieces)
+            if (extent > (1 - FACE_GAIN) * before).all():
+                break
         return pieces
 
-    def _contracted(self, canvas: Bits, claims: Bits | None, sets: StateSet) -> StateSet:
+    def _contracted(self, witnesses: _Pixels, claims: _Pixels | None, sets: StateSet) -> StateSet:
         """The sets, whose arrays are overwritten, without most of the states that the frame contradicts, and without empty sets."""
         if len(sets) == 0:
             return sets
         self._by_altitude(sets)
         grid = _Grid.of(self.scene, sets)
-        lit = _lit_columns(self.scene, canvas, sets, grid)
+        lit = _LitColumns.of(self.scene, witnesses, sets, grid)
         offset = self._offsets(grid, lit)
         if claims is not None:
-            offset = self._by_claims(sets, grid, _lit_columns(self.scene, claims, sets, grid), int(claims.sum()), offset)
+            offset = self._by_claims(sets, grid, claims, offset)
         self._by_offset(sets, offset)
         self._by_ends(sets, grid, lit)
         self._by_altitude(sets)
-        low = np.concatenate([offset[0].T, [sets.x[:, 0], sets.y[:, 0], sets.z[:, 0], sets.scale[:, 0]]])
-        high = np.concatenate([offset[1].T, [sets.x[:, 1], sets.y[:, 1], sets.z[:, 1], sets.scale[:, 1]]])
+        low = np.concatenate([offset[0], [sets.x[:, 0], sets.y[:, 0], sets.z[:, 0], sets.scale[:, 0]]])
+        high = np.concatenate([offset[1], [sets.x[:, 1], sets.y[:, 1], sets.z[:, 1], sets.scale[:, 1]]])
         return sets[~np.logical_or.reduce(inverted(low, high), axis=0)]
 
     def _by_altitude(self, sets: StateSet) -> None:
@@ -97,21 +110,19 @@ class Refiner:
         _draw_in(sets.scale, focal * fall_low / sets.y[:, 1], focal * fall_high / sets.y[:, 0])
         _draw_in(sets.y, focal * fall_low / sets.scale[:, 1], focal * fall_high / sets.scale[:, 0])
 
-    def _offsets(self, grid: _Grid, lit: _LitColumns) -> tuple[Floats, Floats]:
-        """Bounds on the offset (p_x - x) scale of each marking, (sets, markings), from the row borders that all states cross."""
-        u0 = self.scene.camera.u0
-        low = np.maximum(lit.first[..., :-1], lit.first[..., 1:]) - (u0 + OUTWARD_PX)
-        high = np.minimum(lit.last[..., :-1], lit.last[..., 1:]) + (1 - u0 + OUTWARD_PX)
-        slow, fast = (1 / ratio[:, None, 1:-1] for ratio in grid.ratio)
-        low = np.where(grid.crossed, np.minimum(low * slow, low * fast), -NO_BOUND)
-        high = np.where(grid.crossed, np.maximum(high * slow, high * fast), NO_BOUND)
-        spoiled = 2 * self.missed_budget
-        return _largest_but(low, spoiled), -_largest_but(-high, spoiled)
+    def _offsets(self, grid: _Grid, lit: _LitColumns) -> Interval:
+        """Bounds on the offset (p_x - x) scale of each marking, (markings, sets), from the row borders that all states cross."""
+        u0, spoiled = self.scene.camera.u0, 2 * self.missed_budget
+        low = np.maximum(lit.first[:, :-1], lit.first[:, 1:]) - (u0 + OUTWARD_PX)
+        high = np.minimum(lit.last[:, :-1], lit.last[:, 1:]) + (1 - u0 + OUTWARD_PX)
+        slow, fast = (1 / ratio[1:-1] for ratio in grid.ratio)
+        low, high = np.minimum(low * slow, low * fast), np.maximum(high * slow, high * fast)
+        return _largest_but(np.where(grid.crossed, low, -NO_BOUND), spoiled), _smallest_but(np.where(grid.crossed, high, NO_BOUND), spoiled)
 
-    def _by_offset(self, sets: StateSet, offset: tuple[Floats, Floats]) -> None:
+    def _by_offset(self, sets: StateSet, offset: Interval) -> None:
         """Draws scale and x in by offset = (p_x - x) scale: marking by marking, and by the differences of markings, free of x."""
         x_m = self.scene.runway.x_m
-        low, high = offset
+        low, high = offset[0].T, offset[1].T
         scale_low, scale_high = _quotient(low, high, x_m[:, None] - sets.x[:, None, ::-1])
         _draw_in(sets.scale, scale_low.max(axis=1), scale_high.min(axis=1))
         if (sets.x[:, 1] <= sets.x[:, 0]).all():
@@ -124,150 +135,239 @@ class Refiner:
 
     def _by_ends(self, sets: StateSet, grid: _Grid, lit: _LitColumns) -> None:
         """Draws z in: a marking does not go on past the (m + 1)-th row that shows no pixel it could light."""
-        row = grid.rows[:, None, :-1]
-        near_low, far_high = grid.near[0][..., None], grid.far[1][..., None]
-        dark = lit.last < lit.first
-        before_near, behind_far = row + 1 <= near_low, row >= far_high
-        stops, starts = dark & behind_far & ~before_near, dark & before_near & ~behind_far
+        row = grid.rows[:-1]
+        before_near, behind_far = row + 1 <= grid.near[0][:, None], row >= grid.far[1][:, None]
+        stops, starts = lit.dark & behind_far & ~before_near, lit.dark & before_near & ~behind_far
         budget = self.missed_budget + 1
         if budget > 1:
-            stops &= stops.cumsum(axis=2) == budget
-            starts &= starts[..., ::-1].cumsum(axis=2)[..., ::-1] == budget
-        last = np.minimum(np.where(stops, row, NO_ROW).min(axis=2), above(grid.near[1]))
-        first = np.maximum(np.where(starts, row + 1, -NO_ROW).max(axis=2), below(grid.far[0]))
-        distance_low, distance_high = self._distances(sets, np.concatenate([last, first], axis=1))
-        ends_z, markings = self.scene.runway.ends_z_m, last.shape[1]
-        _draw_in(sets.z, (distance_low[:, :markings] - ends_z[:, 0]).max(axis=1), (distance_high[:, markings:] - ends_z[:, 1]).min(axis=1))
+            stops &= stops.cumsum(axis=1) == budget
+            starts &= starts[:, ::-1].cumsum(axis=1)[:, ::-1] == budget
+        last = np.minimum(np.where(stops, row, NO_ROW).min(axis=1), above(grid.near[1]))
+        first = np.maximum(np.where(starts, row + 1, -NO_ROW).max(axis=1), below(grid.far[0]))
+        self._by_distance(sets, nearest_row=last, farthest_row=first)
 
-    def _by_claims(
-        self, sets: StateSet, grid: _Grid, claimed: _LitColumns, in_all: int, offset: tuple[Floats, Floats]
-    ) -> tuple[Floats, Floats]:
-        """Draws z in, and returns the offset's bounds drawn in, by claimed pixels; `in_all` is their number in the frame."""
-        claimed = claimed.of_one_marking()
-        row, spoiled = grid.rows[:, None, :-1], self.extra_budget
-        found = claimed.last >= claimed.first
+    def _by_distance(self, sets: StateSet, nearest_row: Floats, farthest_row: Floats) -> None:
+        """Draws z in: near ends lie no nearer than the ground at `nearest_row`, (markings, sets), far ends no farther than at the other."""
+        ends_z = self.scene.runway.ends_z_m
+        least = self._distances(sets, nearest_row)[0] - ends_z[:, :1]
+        most = self._distances(sets, farthest_row)[1] - ends_z[:, 1:]
+        _draw_in(sets.z, least.max(axis=0), most.min(axis=0))
+
+    def _by_claims(self, sets: StateSet, grid: _Grid, claims: _Pixels, offset: Interval) -> Interval:
+        """Draws z in, and returns the offset's bounds drawn in, by claimed pixels."""
+        claimed = _LitColumns.of(self.scene, claims, sets, grid).of_one_marking()
+        row, spoiled = grid.rows[:-1], self.extra_budget
+        found = ~claimed.dark
         whole = np.zeros_like(found)
-        whole[..., 1:-1] = grid.crossed[..., :-1] & grid.crossed[..., 1:] & found[..., 1:-1]
-        across = self.scene.runway.x_m[:, None] - sets.x[:, None, ::-1]
-        rises, falls = across[..., :1] >= 0, across[..., 1:] <= 0
-        ratios = [ratio[:, None, :] for ratio in grid.ratio]
+        whole[:, 1:-1] = grid.crossed[:, :-1] & grid.crossed[:, 1:] & found[:, 1:-1]
+        across_low, across_high = _across(self.scene, sets)
+        rises, falls = across_low[:, None] >= 0, across_high[:, None] <= 0
         high = claimed.first + 1 - self.scene.camera.u0 + OUTWARD_PX
         low = claimed.last - self.scene.camera.u0 - OUTWARD_PX
-        start = [1 / np.maximum(ratio[..., :-1], 1 / NO_BOUND) for ratio in ratios]
-        stop = [1 / np.maximum(ratio[..., 1:], 1 / NO_BOUND) for ratio in ratios]
+        start = [1 / np.maximum(ratio[:-1], 1 / NO_BOUND) for ratio in grid.ratio]
+        stop = [1 / np.maximum(ratio[1:], 1 / NO_BOUND) for ratio in grid.ratio]
         high = np.where(rises, np.maximum(high * start[0], high * start[1]), np.maximum(high * stop[0], high * stop[1]))
         low = np.where(rises, np.minimum(low * stop[0], low * stop[1]), np.minimum(low * start[0], low * start[1]))
         usable = whole & (rises | falls)
-        offset_high = -_largest_but(np.where(usable, -high, -NO_BOUND), spoiled)
+        offset_high = _smallest_but(np.where(usable, high, NO_BOUND), spoiled)
         offset_low = _largest_but(np.where(usable, low, -NO_BOUND), spoiled)
-        last = _largest_but(np.where(found, row, -NO_ROW).astype(np.float64), spoiled)
-        first = -_largest_but(np.where(found, -row - 1, -NO_ROW).astype(np.float64), spoiled)
-        reach_low, reach_high = below(grid.far[0]), above(grid.near[1])
-        near, far = np.clip(last, reach_low, reach_high), np.clip(first, reach_low, reach_high)
-        distance_low, distance_high = self._distances(sets, np.concatenate([near, far], axis=1))
-        ends_z, markings = self.scene.runway.ends_z_m, last.shape[1]
-        _draw_in(sets.z, (distance_low[:, markings:] - ends_z[:, 1]).max(axis=1), (distance_high[:, :markings] - ends_z[:, 0]).min(axis=1))
-        unexplained = in_all - claimed.count.sum(axis=(1, 2)) > self.extra_budget
-        offset_low[unexplained] = NO_BOUND
+        last = _largest_but(np.where(found, row, -NO_ROW), spoiled)
+        first = _smallest_but(np.where(found, row + 1, NO_ROW), spoiled)
+        self._by_reach(sets, grid, last, first)
+        explained = claims.count(row, claimed.window).sum(axis=(0, 1))
+        offset_low[:, claims.canvas.sum() - explained > self.extra_budget] = NO_BOUND
         return np.maximum(offset[0], offset_low), np.minimum(offset[1], offset_high)
 
-    def _distances(self, sets: StateSet, row: Floats) -> tuple[Floats, Floats]:
-        """Range of the distance d = F (cos(theta) - t sin(theta)) / (scale R) of the ground at rows (sets, rows)."""
+    def _by_reach(self, sets: StateSet, grid: _Grid, last: Floats, first: Floats) -> None:
+        """Draws z in: near ends come at least as near as the ground at row `last`, (markings, sets), far ends reach row `first`."""
+        ends_z = self.scene.runway.ends_z_m
+        reach_low, reach_high = below(grid.far[0]), above(grid.near[1])
+        most = self._distances(sets, np.clip(last, reach_low, reach_high))[1] - ends_z[:, :1]
+        least = self._distances(sets, np.clip(first, reach_low, reach_high))[0] - ends_z[:, 1:]
+        _draw_in(sets.z, least.max(axis=0), most.min(axis=0))
+
+    def _distances(self, sets: StateSet, row: Floats) -> Interval:
+        """Range of the distance d = F (cos(theta) - t sin(theta)) / (scale R) of the ground at rows (rows, sets)."""
         tangent = tangent_of_row(self.scene.camera, row)
         low, high = scale_ratio(sets, tangent)
-        cosine, sine = sets.turn
-        far, near = cosine[:, :1] - sine[:, :1] * tangent, cosine[:, 1:] - sine[:, 1:] * tangent
+        (cosine_low, cosine_high), (sine_low, sine_high) = sets.turn[0].T, sets.turn[1].T
+        far, near = cosine_low - sine_low * tangent, cosine_high - sine_high * tangent
         focal, tiny = self.scene.camera.focal_px, 1 / NO_BOUND
-        slow, fast = np.maximum(sets.scale[:, :1] * low, tiny), np.maximum(sets.scale[:, 1:] * high, tiny)
+        slow, fast = np.maximum(sets.scale[:, 0] * low, tiny), np.maximum(sets.scale[:, 1] * high, tiny)
         return focal * np.minimum(near / fast, near / slow), focal * np.maximum(far / slow, far / fast)
 
 
 @dataclass(frozen=True)
 class _Grid:
-    """The rows that each set can show: `rows` (sets, n + 1) are borders; row i lies between borders i and i + 1.
+    """The rows that each set can show: `rows` (n + 1, sets) are borders; row i lies between borders i and i + 1.
 
-    `ratio` bounds R there; `near` and `far` bound the ends of each marking, (sets, markings), px; `crossed` (sets, markings, n - 1) says
+    `ratio` bounds R there; `near` and `far` bound the ends of each marking, (markings, sets), px; `crossed` (markings, n - 1, sets) says
     which of the inner borders all states of the set cross.
     """
 
-    rows: Rows
-    ratio: tuple[Floats, Floats]
-    near: tuple[Floats, Floats]
-    far: tuple[Floats, Floats]
+    rows: Floats
+    ratio: Interval
+    near: Interval
+    far: Interval
     crossed: Bits
 
     @staticmethod
     def of(scene: Scene, sets: StateSet) -> _Grid:
         near, far = _ends(scene, sets)
-        first = np.floor(below(far[0].min(axis=1))).astype(np.int64)
-        count = int((np.floor(above(near[1].max(axis=1))) - first).max()) + 1
-        rows = first[:, None] + np.arange(count + 1)
+        first = np.floor(below(far[0].min(axis=0)))
+        count = int((np.floor(above(near[1].max(axis=0))) - first).max()) + 1
+        rows = first + np.arange(count + 1, dtype=np.float64)[:, None]
         ratio = scale_ratio(sets, tangent_of_row(scene.camera, rows))
-        inner = rows[:, None, 1:-1]
-        crossed = (inner > above(far[1])[..., None]) & (inner < below(near[0])[..., None])
-        if not (ratio[0] > 0).all():
-            crossed &= (ratio[0] > 0)[:, None, 1:-1]
+        crossed = (rows[1:-1] > above(far[1])[:, None]) & (rows[1:-1] < below(near[0])[:, None])
+        if ratio[0].min() <= 0:
+            crossed &= ratio[0][1:-1] > 0
             ratio = np.maximum(ratio[0], 1 / NO_BOUND), np.maximum(ratio[1], 1 / NO_BOUND)
         return _Grid(rows, ratio, near, far, crossed)
 
 
-def _ends(scene: Scene, sets: StateSet) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
-    """Ranges of the rows of each marking's near and far end, (sets, markings) each; equal distances are computed once."""
+def _ends(scene: Scene, sets: StateSet) -> tuple[Interval, Interval]:
+    """Ranges of the rows of each marking's near and far end, (markings, sets) each; equal distances are computed once."""
     distances = sorted(set(scene.runway.ends_z_m.flat))
-    low, high = end_rows(scene.camera, sets, distances)
+    low, high = (rows.T for rows in end_rows(scene.camera, sets, distances))
     near, far = ([distances.index(end) for end in ends] for ends in scene.runway.ends_z_m.T)
-    return (low[:, near], high[:, near]), (low[:, far], high[:, far])
+    return (low[near], high[near]), (low[far], high[far])
+
+
+def _across(scene: Scene, sets: StateSet) -> Interval:
+    """Range of p_x - x, (markings, sets)."""
+    x_m = scene.runway.x_m[:, None]
+    return x_m - sets.x[:, 1], x_m - sets.x[:, 0]
 
 
 @dataclass(frozen=True)
 class _LitColumns:
-    """First and last lit column among those a marking could light in a row, (sets, markings, rows); last < first where none is.
+    """First and last lit column among those a marking could light in a row, (markings, rows, sets); where none is, `dark`.
 
-    `window` bounds the columns that could be lit at all, `count` is how many of them are.
+    `window` bounds the columns that could be lit at all.
     """
 
     first: Floats
     last: Floats
-    window: tuple[Rows, Rows]
-    count: Rows
+    dark: Bits
+    window: Interval
+
+    @staticmethod
+    def of(scene: Scene, pixels: _Pixels, sets: StateSet, grid: _Grid) -> _LitColumns:
+        """Looks the usable columns up in the frame."""
+        u0 = scene.camera.u0
+        across_low, across_high = (across[:, None] for across in _across(scene, sets))
+        slow, fast = sets.scale[:, 0] * grid.ratio[0], sets.scale[:, 1] * grid.ratio[1]
+        low, high = np.minimum(across_low * slow, across_low * fast), np.maximum(across_high * slow, across_high * fast)
+        window = (
+            np.floor(np.minimum(low[:, :-1], low[:, 1:]) + (u0 - OUTWARD_PX)),
+            np.floor(np.maximum(high[:, :-1], high[:, 1:]) + (u0 + OUTWARD_PX)),
+        )
+        return _LitColumns._marked(*pixels.nearest(grid.rows[:-1], window), window)
+
+    @staticmethod
+    def _marked(first: Floats, last: Floats, window: Interval) -> _LitColumns:
+        """With bounds that no state meets, where no pixel is lit."""
+        dark = last < first
+        np.copyto(first, NO_BOUND, where=dark)
+        np.copyto(last, -NO_BOUND, where=dark)
+        return _LitColumns(first, last, dark, window)
 
     def of_one_marking(self) -> _LitColumns:
         """The same without the rows in which another marking could light one of a marking's columns."""
         low, high = self.window
         shared = np.zeros(low.shape, dtype=bool)
-        for left, right in itertools.permutations(range(low.shape[1]), 2):
-            shared[:, left] |= (low[:, left] <= high[:, right]) & (low[:, right] <= high[:, left])
-        return replace(self, first=np.where(shared, NO_BOUND, self.first), last=np.where(shared, -NO_BOUND, self.last))
+        for left, right in itertools.permutations(range(len(low)), 2):
+            shared[left] |= (low[left] <= high[right]) & (low[right] <= high[left])
+        return self._marked(np.where(shared, NO_BOUND, self.first), np.where(shared, -NO_BOUND, self.last), self.window)
 
 
-def _lit_columns(scene: Scene, canvas: Bits, sets: StateSet, grid: _Grid) -> _LitColumns:
-    """Looks the usable columns up in the frame; `canvas` is the frame within a border of lit pixels."""
-    across = scene.runway.x_m[:, None] - sets.x[:, None, ::-1]
-    slow, fast = sets.scale[:, :1] * grid.ratio[0], sets.scale[:, 1:] * grid.ratio[1]
-    low, high = column_range(scene.camera, across, (slow[:, None, :], fast[:, None, :]))
-    first = np.floor(below(np.minimum(low[..., :-1], low[..., 1:]))).astype(np.int64)
-    last = np.floor(above(np.maximum(high[..., :-1], high[..., 1:]))).astype(np.int64)
-    height, width = scene.camera.shape
-    row_start = (np.clip(grid.rows[:, None, :-1], -1, height) + 1) * (width + 2) + 1
-    pixels = canvas.ravel()
-    lowest, highest = np.full(first.shape, NO_BOUND), np.full(first.shape, -NO_BOUND)
-    count = np.zeros(first.shape, dtype=np.int64)
-    for step in range(int((last - first).max()) + 1):
-        column = first + step
-        lit = pixels.take(row_start + np.clip(column, -1, width)) & (column <= last)
-        np.minimum(lowest, column, out=lowest, where=lit)
-        np.copyto(highest, column, where=lit)
-        count += lit
-    return _LitColumns(lowest, highest, (first, last), count)
+@dataclass(frozen=True)
+class _Pixels:
+    """A window of a frame, ready to be asked for the lit pixels of a stretch of a row. What lies beyond it is lit, or all dark.
+
+    `canvas` (rows + 2, columns + 2) holds the window within a border that stands for all beyond it; `top` and `left` are the border's.
+    """
+
+    canvas: Bits
+    top: int
+    left: int
+    beyond: bool
+
+    @staticmethod
+    def of(frame: Bits, window: tuple[slice, slice], beyond: bool) -> _Pixels:
+        """The pixels of `window`; `beyond`: are those outside of it lit?"""
+        seen = frame[window]
+        canvas = np.full((seen.shape[0] + 2, seen.shape[1] + 2), beyond)
+        canvas[1:-1, 1:-1] = seen
+        return _Pixels(canvas, (window[0].start or 0) - 1, (window[1].start or 0) - 1, beyond)
+
+    @cached_property
+    def following(self) -> Floats:
+        """The nearest lit column at or after each pixel, flat; without bound beyond the window."""
+        column = np.where(self.canvas, np.arange(self.canvas.shape[1], dtype=np.int16), NO_COLUMN)
+        for step in _doubling(column.shape[1]):
+            np.minimum(column[:, :-step], column[:, step:], out=column[:, :-step])
+        return self._unbounded(column, -NO_BOUND)
+
+    @cached_property
+    def preceding(self) -> Floats:
+        """The nearest lit column at or before each pixel, flat; without bound beyond the window."""
+        column = np.where(self.canvas, np.arange(self.canvas.shape[1], dtype=np.int16), -NO_COLUMN)
+        for step in _doubling(column.shape[1]):
+            np.maximum(column[:, step:], column[:, :-step], out=column[:, step:])
+        return self._unbounded(column, NO_BOUND)
+
+    @cached_property
+    def counted(self) -> Rows:
+        """How many pixels of its row are lit up to each pixel, flat."""
+        return np.cumsum(self.canvas, axis=1, dtype=np.int64).ravel()
+
+    def nearest(self, row: Floats, stretch: Interval) -> Interval:
+        """First and last lit column of the columns from stretch[0] to stretch[1]; the last is before the first where none is lit.
+
+        Where a stretch reaches beyond the window it has no bound on that side, if what lies there is lit.
+        """
+        start = self._start(row)
+        return self.following.take(self._place(start, stretch[0])), self.preceding.take(self._place(start, stretch[1]))
+
+    def count(self, row: Floats, stretch: Interval) -> Rows:
+        """How many columns from stretch[0] to stretch[1] are lit."""
+        start = self._start(row)
+        return self.counted.take(self._place(start, stretch[1])) - self.counted.take(self._place(start, stretch[0] - 1))
+
+    def _start(self, row: Floats) -> Floats:
+        """Where a row starts in the flat tables."""
+        return np.minimum(np.maximum(row - self.top, 0), self.canvas.shape[0] - 1) * self.canvas.shape[1]
+
+    def _place(self, start: Floats, column: Floats) -> Rows:
+        return (start + np.minimum(np.maximum(column - self.left, 0), self.canvas.shape[1] - 1)).astype(np.int64)
+
+    def _unbounded(self, column: NDArray[np.int16], value: float) -> Floats:
+        """As columns of the frame, flat, with `value` on the border if what lies there is lit."""
+        columns = column.astype(np.float64) + self.left
+        if self.beyond:
+            columns[0] = columns[-1] = value
+            columns[:, 0] = columns[:, -1] = value
+        return columns.ravel()
+
+
+def _doubling(count: int) -> list[int]:
+    """1, 2, 4, ... below `count`: steps that carry a value over any distance."""
+    return [1 << power for power in range((count - 1).bit_length())]
 
 
 def _largest_but(values: Floats, count: int) -> Floats:
-    """The largest value along the last axis but for `count` larger ones."""
+    """The largest value along axis 1 but for `count` larger ones."""
     if count == 0:
-        return values.max(axis=-1)
-    if count >= values.shape[-1]:
-        return np.full(values.shape[:-1], -NO_BOUND)
-    return np.partition(values, -count - 1, axis=-1)[..., -count - 1]
+        return values.max(axis=1)
+    if count >= values.shape[1]:
+        return np.full((len(values), *values.shape[2:]), -NO_BOUND)
+    return np.partition(values, -count - 1, axis=1)[:, -count - 1]
+
+
+def _smallest_but(values: Floats, count: int) -> Floats:
+    """The smallest value along axis 1 but for `count` smaller ones."""
+    return -_largest_but(-values, count) if count else values.min(axis=1)
 
 
 def _draw_in(interval: Floats, low: Floats, high: Floats) -> None:
@@ -315,6 +415,12 @@ def _carries_a_face(sets: StateSet, pieces: int) -> Bits:
         chosen[np.argpartition(bound[:, 0], pieces)[:pieces]] = True
         chosen[np.argpartition(-bound[:, 1], pieces)[:pieces]] = True
     return chosen
+
+
+def _extent(sets: StateSet) -> Floats:
+    """Sides of the box around all sets, along theta, y and z; of no sets, 0."""
+    intervals = np.stack([sets.theta, sets.y, sets.z])
+    return intervals[..., 1].max(axis=1, initial=-np.inf) - intervals[..., 0].min(axis=1, initial=np.inf)
 
 
 def connected_parts(sets: StateSet) -> list[NDArray[np.int64]]:

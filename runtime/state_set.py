@@ -158,19 +158,19 @@ def _row(camera: Camera, sets: StateSet, side: int, y: Floats, d: Floats, beside
 
 
 def scale_ratio(sets: StateSet, tangent: Floats) -> tuple[Floats, Floats]:
-    """Range of R = s(theta, t) / s(theta, t_ref) over each set; `tangent` (sets, rows). Below the horizon R > 0: bounds stop at 0."""
+    """Range of R = s(theta, t) / s(theta, t_ref) over each set; `tangent` (rows, sets). Below the horizon R > 0: bounds stop at 0."""
     (cosine, sine), reference = sets.turn, sets.reference_fall
-    first = tangent * (cosine[:, :1] / reference[:, :1]) + sine[:, :1] / reference[:, :1]
-    second = tangent * (cosine[:, 1:] / reference[:, 1:]) + sine[:, 1:] / reference[:, 1:]
+    (slope, other_slope), (start, other_start) = (cosine / reference).T, (sine / reference).T
+    first, second = tangent * slope + start, tangent * other_slope + other_start
     return np.maximum(np.minimum(first, second), 0), np.maximum(np.maximum(first, second), 0)
 
 
 def scale_between(camera: Camera, sets: StateSet, start: Floats, stop: Floats) -> tuple[Floats, Floats]:
     """Range of g over rows with tangents [start, stop], (sets, rows) each; g rises with the row."""
     theta, y = sets.theta[:, None, :], sets.y[:, None, :]
-    low_on_scale, high_on_scale = sets.scale[:, :1] * scale_ratio(sets, start)[0], sets.scale[:, 1:] * scale_ratio(sets, stop)[1]
+    slowest, fastest = scale_ratio(sets, start.T)[0].T, scale_ratio(sets, stop.T)[1].T
     low, high = scale_range(camera, theta, y, start)[0], scale_range(camera, theta, y, stop)[1]
-    return np.maximum(low_on_scale, low), np.minimum(high_on_scale, np.maximum(high, 0))
+    return np.maximum(sets.scale[:, :1] * slowest, low), np.minimum(sets.scale[:, 1:] * fastest, np.maximum(high, 0))
 
 
 def column_range(camera: Camera, across: Floats, scale: tuple[Floats, Floats]) -> tuple[Floats, Floats]:

@@ -104,7 +104,7 @@ def test_scales_and_columns_lie_in_their_ranges(scene: Scene, data: st.DataObjec
     camera = scene.camera
     rows = camera.v0 + camera.focal_px * sets.tangent[0] + np.array([-40.0, -7.5, 0.0, 3.25, 60.0])
     tangent = tangent_of_row(camera, rows)[None]
-    ratio_low, ratio_high = (bound[0] for bound in scale_ratio(sets, tangent))
+    ratio_low, ratio_high = (bound[:, 0] for bound in scale_ratio(sets, tangent.T))
     own_low, own_high = (bound[0] for bound in scale_between(camera, sets, tangent, tangent))
     span_low, span_high = (bound[0] for bound in scale_between(camera, sets, tangent[:, :1], tangent[:, -1:]))
     held_low, held_high = scale_range(camera, sets.theta[:, None, :], sets.y[:, None, :], tangent)
