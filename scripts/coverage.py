@@ -4,7 +4,7 @@
     python scripts/coverage.py [the same options] --replay "SCENARIO#NUMBER"
 
 The runway's images are drawn in rational numbers by code that the build does not have (`rational_image`), the frames are those of
-`coverage_frames`, and `coverage_judge` says of which states a box must hold. One that does not, or one lit pixel of a judged runway that
+`coverage_scenarios`, and `coverage_judge` says of which states a box must hold. One that does not, or one lit pixel of a judged runway that
 `filtered` loses, is a violation: it is written with what is needed to replay it, and the exit code is 1. Finished chunks are kept beside
 the output: the same command goes on where it was stopped, and begins anew if model, code, seed or recording are others.
 """
@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import os
 import sys
 from collections.abc import Iterable
@@ -23,9 +22,10 @@ from typing import Annotated
 
 import joblib
 import typer
-from coverage_frames import Scenario, Stage, scenarios
 from coverage_judge import HALF_WIDTHS, Tally, Violation, judge_frame, quantile
 from coverage_models import DERIVED, build_models
+from coverage_scenarios import Scenario, scenarios
+from coverage_states import Stage
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn, track
 from rich.table import Table
@@ -123,7 +123,8 @@ def chunks_of(models: dict[str, Path], chosen: list[Scenario], frames: int, reco
 def run_campaign(chunks: list[Chunk], journal: Journal, jobs: int) -> None:
     """Runs what the journal does not have yet, and enters it as it is finished."""
     missing = [chunk for chunk in chunks if chunk.key not in journal.done]
-    columns = (TextColumn("frames"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.fields[violations]} violations"))
+    found_so_far = TextColumn("{task.fields[violations]} violations")
+    columns = (TextColumn("frames"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), found_so_far)
     with Progress(*columns, console=Console(stderr=True)) as bar:
         found = sum(len(violations) for _, violations in journal.done.values())
         done = sum(chunk.frames for chunk in chunks) - sum(chunk.frames for chunk in missing)
@@ -143,8 +144,9 @@ def table(results: dict[str, Tally]) -> Table:
         view.add_column(heading, justify="right" if heading != "scenario" else "left")
     for name, tally in (*results.items(), ("all", sum(results.values(), Tally()))):
         certified = max(tally.certified, 1)
-        row = [name, tally.frames, tally.judged, tally.certified, tally.violations, tally.pixels_lost, f"{tally.no_runway / tally.frames:.2%}"]
-        row += [f"{tally.at_boundary / certified:.1%}", f"{tally.passing / certified:.2f}", f"{tally.named / certified:.1%}", tally.fallbacks]
+        row = [name, tally.frames, tally.judged, tally.certified, tally.violations, tally.pixels_lost]
+        row += [f"{tally.no_runway / tally.frames:.2%}", f"{tally.at_boundary / certified:.1%}", f"{tally.passing / certified:.2f}"]
+        row += [f"{tally.named / certified:.1%}", tally.fallbacks]
         row += [" ".join(f"{quantile(getattr(tally, axis), 0.5):.4f}" for axis in HALF_WIDTHS)]
         row += [f"{quantile(tally.error, level):.4f}" for level in (0.5, 0.95)]
         view.add_row(*map(str, row), end_section=name == list(results)[-1])

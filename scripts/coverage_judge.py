@@ -10,12 +10,15 @@ from __future__ import annotations
 import zlib
 from collections import Counter
 from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
-from coverage_frames import Picture, Scenario, Stage, estimator_of, thickened
-from rational_image import Frame, RationalState
+from coverage_frames import Picture
+from coverage_scenarios import Scenario
+from coverage_states import Stage, estimator_of, image_of, spatial_mask
+from rational_image import Frame, RationalState, RunwayImage
 
-from runtime import Estimate, Estimator
+from runtime import Estimate
 
 GRID = 1e-4
 """Errors and half-widths are counted in steps of this, rad or m: the last place that is printed."""
@@ -49,10 +52,12 @@ class Tally:
         return Tally(*(getattr(self, part.name) + getattr(other, part.name) for part in fields(self)))
 
     @staticmethod
-    def read(tables: dict[str, int | dict[str, int]]) -> Tally:
+    def read(tables: dict[str, Any]) -> Tally:
         """A tally from JSON, which knows no whole numbers as keys."""
-        parts = {name: Counter({int(key): n for key, n in part.items()}) if isinstance(part, dict) else part for name, part in tables.items()}
-        return Tally(**parts)  # pyright: ignore[reportArgumentType]
+        tally = Tally(**tables)
+        for name in ("error", *HALF_WIDTHS):
+            setattr(tally, name, Counter({int(key): count for key, count in tables[name].items()}))
+        return tally
 
 
 def quantile(histogram: Counter[int], share: float) -> float:
@@ -94,8 +99,9 @@ def judge_frame(stage: Stage, scenario: Scenario, seed: int, number: int) -> tup
     faults = faults_of(picture, judged, estimate)
     unrefined = number % UNREFINED_EVERY == 0
     if unrefined:
-        faults += [("unrefined: " + fault, state) for fault, state in faults_of(picture, judged, estimator.estimate(picture.frame, refine=False))]
-    lost = sum(int((each.lit & (estimate.filtered == 0)).sum()) for each in judged)
+        hull = estimator.estimate(picture.frame, refine=False)
+        faults += [("unrefined: " + fault, state) for fault, state in faults_of(picture, judged, hull)]
+    lost = sum(pixels_lost(each, estimate) for each in judged)
     tally = tally_of(stage, picture, estimate, judged, len(faults), lost)
     tally.unrefined = int(unrefined)
     return tally, [Violation(scenario.name, seed, number, str(state), fault) for fault, state in faults]
@@ -108,19 +114,23 @@ def judged_states(picture: Picture, missed: int, extra: int, runway: bool) -> li
     for number, state in enumerate(picture.states if runway else ()):
         if not stage.contains(state):
             continue
-        image = stage.view.image(state)
+        image = image_of(stage.view, state)
         if stage.unwitnessed(image, picture.frame) <= missed and (extra < 0 or claimed_by_none(picture, state, image) <= extra):
-            drawn = picture.runway if number == 0 else picture.camera.image(state)
+            drawn = picture.runway if number == 0 else image_of(picture.camera, state).frame
             judged.append(Judged(state, drawn & picture.frame))
     return judged
 
 
-def claimed_by_none(picture: Picture, state: RationalState, image: Frame) -> int:
+def pixels_lost(judged: Judged, estimate: Estimate) -> int:
+    """Lit pixels of a judged runway that `filtered` does not have."""
+    return int((judged.lit & (estimate.filtered == 0)).sum())
+
+
+def claimed_by_none(picture: Picture, state: RationalState, image: RunwayImage) -> int:
     """Lit pixels in S of a cell that holds the state which are farther from its image than the tolerance."""
     stage = picture.stage
-    own = thickened(image, stage.scene.tolerance.line_px)
-    foreign = picture.frame & ~own
-    return min(int((foreign & estimator_of(stage.path).spatial_mask(cell)).sum()) for cell in stage.cells_of(state))
+    foreign = picture.frame & ~image.thickened(stage.scene.tolerance.line_px)
+    return min(int((foreign & spatial_mask(stage.path, cell)).sum()) for cell in stage.cells_of(state))
 
 
 def faults_of(picture: Picture, judged: list[Judged], estimate: Estimate) -> list[tuple[str, RationalState]]:
@@ -134,8 +144,8 @@ def faults_of(picture: Picture, judged: list[Judged], estimate: Estimate) -> lis
             faults.append((f"not in the box {estimate.box.lower.tolist()} {estimate.box.upper.tolist()}", each.state))
         elif not any(each.state.within(region.lower, region.upper) for region in estimate.regions):
             faults.append(("in no region", each.state))
-        if (each.lit & (estimate.filtered == 0)).any():
-            faults.append((f"filtered lacks {(each.lit & (estimate.filtered == 0)).sum()} pixels", each.state))
+        if lost := pixels_lost(each, estimate):
+            faults.append((f"filtered lacks {lost} pixels", each.state))
     if (estimate.filtered.astype(bool) & ~picture.frame).any():
         faults.append(("filtered adds pixels", picture.states[0]))
     if estimate.box is not None and (estimate.state is None or not estimate.box.contains(estimate.state)):

@@ -97,6 +97,31 @@ class Stripe:
 
 
 @dataclass(frozen=True)
+class RunwayImage:
+    """Lit pixels, as a frame (height, width) and as rows and columns in the order of the frame, all read-only."""
+
+    frame: Frame
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        for array in (self.frame, self.rows, self.columns):
+            array.flags.writeable = False
+
+    @property
+    def flat(self) -> NDArray[np.int64]:
+        """Numbers of the pixels in the flattened frame, ascending."""
+        return self.rows * self.frame.shape[1] + self.columns
+
+    def thickened(self, reach: int) -> Frame:
+        """A frame in which everything is lit that lies within `reach` rows and columns of a pixel."""
+        thick = np.zeros_like(self.frame)
+        for row, column in zip(self.rows.tolist(), self.columns.tolist(), strict=True):
+            thick[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1] = True
+        return thick
+
+
+@dataclass(frozen=True)
 class RationalView:
     """A camera and what it looks at. `roll` and `yaw` are the tangents of half the angles by which the camera is off."""
 
@@ -143,17 +168,18 @@ class RationalView:
 
     def segments(self, state: RationalState) -> list[tuple[Point, Point]]:
         """The near and the far end of each marking in the image."""
-        return [
-            (self.project(state, stripe.x, stripe.near_z), self.project(state, stripe.x, stripe.far_z)) for stripe in self.stripes
-        ]
+        return [(self.project(state, stripe.x, stripe.near_z), self.project(state, stripe.x, stripe.far_z)) for stripe in self.stripes]
 
-    def image(self, state: RationalState) -> Frame:
-        """The frame (height, width) in which every pixel is lit that a marking meets."""
+    def image(self, state: RationalState) -> RunwayImage:
+        """Every pixel of the frame that a marking meets."""
         frame = np.zeros(self.shape, dtype=np.bool_)
+        pixels = set()
         for start, stop in self.segments(state):
             for row, first, last in lit_columns(start, stop, self.height):
-                frame[row, max(first, 0) : max(last + 1, 0)] = True
-        return frame
+                pixels.update((row, column) for column in range(max(first, 0), min(last, self.width - 1) + 1))
+        rows, columns = np.array(sorted(pixels), dtype=np.int64).reshape(-1, 2).T
+        frame[rows, columns] = True
+        return RunwayImage(frame, rows, columns)
 
 
 def lit_columns(start: Point, stop: Point, height: int) -> Iterator[tuple[int, int, int]]:
