@@ -23,7 +23,7 @@ from typing import Annotated
 import joblib
 import typer
 from coverage_judge import HALF_WIDTHS, Tally, Violation, judge_frame, quantile
-from coverage_models import DERIVED, build_models
+from coverage_models import DERIVED, build_model
 from coverage_scenarios import Scenario, scenarios
 from coverage_states import Stage
 from rich.console import Console
@@ -180,14 +180,18 @@ def report(chunks: list[Chunk], journal: Journal, output: Path) -> int:
     return len(violations)
 
 
-def replay(text: str, chosen: list[Scenario], models: dict[str, Path], recording: Path | None, seed: int) -> int:
-    """Draws and judges one frame again, prints what is found, and returns the number of violations."""
+def named(text: str, chosen: list[Scenario]) -> tuple[Scenario, int]:
+    """The scenario and the number of a frame given as "SCENARIO#NUMBER"."""
     name, _, number = text.rpartition("#")
     scenario = next((each for each in chosen if each.name == name), None)
     if scenario is None or not number.isdecimal():
         raise typer.BadParameter(f'found {text!r}; give "SCENARIO#NUMBER" as the report of a violation does')
-    stage = Stage.of(str(models[scenario.model]), None if recording is None else str(recording))
-    tally, violations = judge_frame(stage, scenario, seed, int(number))
+    return scenario, int(number)
+
+
+def replay(chunk: Chunk) -> int:
+    """Draws and judges a chunk's frames again, prints what is found, and returns the number of violations."""
+    _, tally, violations = chunk.run()
     print(f"{tally.judged} states judged, {len(violations)} violations")
     for each in violations:
         print(f"{each.fault}\n    state {each.state}")
@@ -208,10 +212,13 @@ def main(
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     given = Estimator.load(model)
     chosen = list(scenarios(recording is not None, given.metadata["smallest_must_light"] - 1))
-    built = build_models(given.scene, output.parent, jobs)
-    models = {"given": model, **dict(track(built, "models", len(DERIVED), console=Console(stderr=True)))}
     if replay_frame is not None:
-        sys.exit(int(replay(replay_frame, chosen, models, recording, seed) > 0))
+        scenario, number = named(replay_frame, chosen)
+        path = model if scenario.model == "given" else build_model(given.scene, scenario.model, output.parent, jobs)
+        sys.exit(int(replay(Chunk(scenario, str(path), None if recording is None else str(recording), seed, number, 1, "")) > 0))
+    models = {"given": model}
+    for name in track(DERIVED, "models", console=Console(stderr=True)):
+        models[name] = build_model(given.scene, name, output.parent, jobs)
     chunks = chunks_of(models, chosen, frames, recording, seed)
     journal = Journal(output.with_suffix(".chunks.jsonl"), chunks)
     try:

@@ -16,7 +16,7 @@ import numpy as np
 from coverage_frames import Picture
 from coverage_scenarios import Scenario
 from coverage_states import Stage, estimator_of, image_of, spatial_mask
-from rational_image import Frame, RationalState, RunwayImage
+from rational_image import Frame, RationalState
 
 from runtime import Estimate
 
@@ -111,13 +111,12 @@ def judged_states(picture: Picture, missed: int, extra: int, runway: bool) -> li
     """The states that the assumptions hold for."""
     stage = picture.stage
     judged = []
-    for number, state in enumerate(picture.states if runway else ()):
+    for state in picture.states if runway else ():
         if not stage.contains(state):
             continue
-        image = image_of(stage.view, state)
-        if stage.unwitnessed(image, picture.frame) <= missed and (extra < 0 or claimed_by_none(picture, state, image) <= extra):
-            drawn = picture.runway if number == 0 else image_of(picture.camera, state).frame
-            judged.append(Judged(state, drawn & picture.frame))
+        image, seen = image_of(stage.view, state), image_of(picture.camera, state).frame
+        if stage.unwitnessed(image, picture.frame) <= missed and (extra < 0 or claimed_by_none(picture, state) <= extra):
+            judged.append(Judged(state, seen & picture.frame))
     return judged
 
 
@@ -126,11 +125,11 @@ def pixels_lost(judged: Judged, estimate: Estimate) -> int:
     return int((judged.lit & (estimate.filtered == 0)).sum())
 
 
-def claimed_by_none(picture: Picture, state: RationalState, image: RunwayImage) -> int:
-    """Lit pixels in S of a cell that holds the state which are farther from its image than the tolerance."""
+def claimed_by_none(picture: Picture, state: RationalState) -> int:
+    """Lit pixels in S of a cell that holds the state, but for those within the tolerance of its image and its runway as it is seen."""
     stage = picture.stage
-    foreign = picture.frame & ~image.thickened(stage.scene.tolerance.line_px)
-    return min(int((foreign & spatial_mask(stage.path, cell)).sum()) for cell in stage.cells_of(state))
+    own = image_of(stage.view, state).thickened(stage.scene.tolerance.line_px) | image_of(picture.camera, state).frame
+    return min(int((picture.frame & ~own & spatial_mask(stage.path, cell)).sum()) for cell in stage.cells_of(state))
 
 
 def faults_of(picture: Picture, judged: list[Judged], estimate: Estimate) -> list[tuple[str, RationalState]]:

@@ -140,3 +140,6 @@ def scenarios(recording: bool, largest_missed: int) -> Iterator[Scenario]:
     for side in ("left", "top", "bottom"):
         yield Scenario(f"cut by the {side} border", (few,), cut_by_the_frame, f"cut {side}")
         yield Scenario(f"cut by the {side} border, camera off", (few,), cut_by_the_frame, f"cut {side}, tolerant")
+    for place in ("above", "below"):
+        yield Scenario(f"a marking barely {place} the frame, camera off", (few,), cut_by_the_frame, f"barely {place}")
+        yield Scenario(f"the same {place}, B: e pixels in S", (few,), cut_by_the_frame, f"barely {place}", extra=(0, 1, 3, 8))

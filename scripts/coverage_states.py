@@ -194,10 +194,14 @@ def outside(rng: Rng, stage: Stage, by: float) -> RationalState:
 
 
 def cut_by_the_frame(rng: Rng, stage: Stage) -> RationalState:
-    """A state some part of whose runway is out of view, now and then on a face of a cell."""
-    if rng.random() < 0.2:
+    """A state some part of whose runway is out of view, often a whole marking by a fraction of a pixel, or one on a face of a cell."""
+    kind = rng.random()
+    if kind < 0.2:
         return on_faces(rng, stage)
-    states = rng.uniform(stage.lower, stage.upper, (TRIES, 4))
-    ends = project(stage.scene, states).reshape(TRIES, -1, 2)
-    partly = ((ends < 0) | (ends >= [stage.view.width, stage.view.height])).any(axis=(1, 2))
-    return into_domain(stage, RationalState.near(states[partly.argmax()]))
+    states = stage.lower + rng.beta(0.3, 0.3, (TRIES, 4)) * (stage.upper - stage.lower)
+    ends = project(stage.scene, states)
+    beyond = np.maximum(-ends, ends - [stage.view.width, stage.view.height]).max(axis=3)
+    whole = beyond.min(axis=2)
+    barely = np.where(whole > 0, whole, np.inf).min(axis=1).argmin()
+    partly = (beyond > 0).any(axis=(1, 2)).argmax()
+    return into_domain(stage, RationalState.near(states[barely if kind < 0.6 else partly]))
