@@ -39,8 +39,19 @@ def displacement_px(scene: Scene, window: Window) -> float:
 
 
 def check_calibration(scene: Scene, window: Window) -> float:
-    """The bound on the displacement, px. Raises `SceneError` unless `tolerance.line_px` is at least that, rounded up."""
-    shift = displacement_px(scene, window)
+    """The bound on the displacement, px, of all that `window`, which holds every S, can show of the markings.
+
+    Where the window reaches the frame's border, points up to `line_px` beyond it count too, since the shift can bring them into view.
+    Raises `SceneError` unless `tolerance.line_px` is at least the bound, rounded up.
+    """
+    beyond, (height, width) = scene.tolerance.line_px, scene.camera.shape
+    shown = Window(
+        top=window.top - beyond * (window.top == 0),
+        bottom=window.bottom + beyond * (window.bottom == height),
+        left=window.left - beyond * (window.left == 0),
+        right=window.right + beyond * (window.right == width),
+    )
+    shift = displacement_px(scene, shown)
     needed = math.ceil(shift)
     if needed > scene.tolerance.line_px:
         raise SceneError(

@@ -13,7 +13,7 @@ from runtime.scene import Camera, Scene
 from runtime.state_set import Floats, StateSet, column_range, end_rows, fall, reach, scale_between, tangent_of_row
 
 Columns = tuple[NDArray[np.int64], NDArray[np.int64]]
-"""First and last column a marking lights in a row, two arrays (sets, markings, height); none where last < first."""
+"""First and last column a marking lights in a row, two arrays (sets, markings, rows); none where last < first."""
 
 
 def _scale_at_distance(camera: Camera, theta: Floats, d: Floats, start: Floats, stop: Floats) -> tuple[Floats, Floats]:
@@ -37,14 +37,14 @@ def _altitude(theta: Floats, tangent: Floats, d: Floats) -> Floats:
     return np.where(falls <= 0, 0.0, np.where(reaches > 0, d * falls / np.where(reaches > 0, reaches, 1.0), np.inf))
 
 
-def columns_that_may_be_lit(scene: Scene, sets: StateSet) -> Columns:
+def columns_that_may_be_lit(scene: Scene, sets: StateSet, beyond_px: int = 0) -> Columns:
     """Outer enclosure of I_r: each pixel that some state of the set lights lies within the returned columns of its row.
 
-    A point of a marking that is seen in a row lies d ahead, with d between the marking's ends: that bounds the altitudes which
-    show it, and its scale, in each row on its own.
+    The rows are those of the frame and `beyond_px` more above and below it. A point of a marking that is seen in a row lies d ahead, with
+    d between the marking's ends: that bounds the altitudes which show it, and its scale, in each row on its own.
     """
     camera = scene.camera
-    top = np.arange(camera.height, dtype=np.float64)
+    top = np.arange(-beyond_px, camera.height + beyond_px, dtype=np.float64)
     enclosures = []
     for marking in scene.runway.markings:
         d = sets.z + np.array(marking.ends_z_m)

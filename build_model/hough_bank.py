@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from build_model.enclosure import columns_that_may_be_lit, columns_that_must_be_lit
-from build_model.pixel_mask import Bits, Runs, Window, clip_and_widen, paint, runs_of
+from build_model.pixel_mask import Bits, Runs, Window, inset, paint, runs_of, widened
 from build_model.spatial_filter import reference_row, sliced, spatial_filter
 from runtime.rounding import float32_above, float32_below, inverted
 from runtime.scene import STATE_NAMES, Camera, Scene, SceneError
@@ -166,9 +166,9 @@ def _entries(
     states = contract(scene.camera, lines.states(scene.camera, lower, upper))
     kept = ~(inverted(*states.theta.T) | inverted(*states.y.T))
     lines, states = lines[kept], states[kept]
-    widen_px = scene.tolerance.line_px
-    may_light = paint(clip_and_widen(scene, columns_that_may_be_lit(scene, states), widen_px), window) & spatial
-    must_light = paint(clip_and_widen(scene, columns_that_must_be_lit(scene, states), -widen_px), window)
+    line_px = scene.tolerance.line_px
+    may_light = paint(widened(scene, columns_that_may_be_lit(scene, states, line_px), line_px), window) & spatial
+    must_light = paint(inset(scene, columns_that_must_be_lit(scene, states), line_px), window)
     return _Entries(lines, states, must_light, may_light)
 
 

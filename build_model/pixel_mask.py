@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from build_model.enclosure import Columns
@@ -63,25 +64,33 @@ class Runs:
         return np.bincount(self.mask, weights=self.stop - self.start, minlength=masks).astype(np.int64)
 
 
-def clip_and_widen(scene: Scene, columns: Columns, widen_px: int) -> Columns:
-    """Columns widened by `widen_px` pixels in the sup norm, then clipped to the frame. `widen_px` < 0 keeps off the frame's border.
+def widened(scene: Scene, columns: Columns, by_px: int) -> Columns:
+    """Columns of the frame's rows and `by_px` more on both sides, widened by `by_px` in the sup norm, then clipped to the frame.
 
-    Rows of a marking touch each other, so the widened mask is again one run of columns a row.
+    What lies outside the frame counts as well, since widening may bring it in. Rows of a marking touch each other, so the widened mask
+    is again one run of columns a row.
     """
     first, last = columns
+    width = scene.camera.width
+    empty = last < first
+    span = 2 * by_px + 1
+    first = sliding_window_view(np.where(empty, width, first - by_px), span, axis=2).min(axis=-1)
+    last = sliding_window_view(np.where(empty, -1, last + by_px), span, axis=2).max(axis=-1)
+    return _only(first <= last, np.maximum(first, 0), np.minimum(last, width - 1), width)
+
+
+def inset(scene: Scene, columns: Columns, by_px: int) -> Columns:
+    """Columns of the frame's rows, without the pixels that are less than `by_px` pixels away from the frame's border."""
     height, width = scene.camera.shape
-    inset = max(-widen_px, 0)
-    if widen_px > 0:
-        empty = last < first
-        first, last = np.where(empty, width, first - widen_px), np.where(empty, -1, last + widen_px)
-        padding = ((0, 0), (0, 0), (widen_px, widen_px))
-        span = 2 * widen_px + 1
-        first = np.lib.stride_tricks.sliding_window_view(np.pad(first, padding, constant_values=width), span, axis=2).min(-1)
-        last = np.lib.stride_tricks.sliding_window_view(np.pad(last, padding, constant_values=-1), span, axis=2).max(-1)
-    first, last = np.maximum(first, inset), np.minimum(last, width - 1 - inset)
-    rows = np.arange(height)
-    outside = (rows < inset) | (rows >= height - inset) | (last < first)
-    return np.where(outside, width, first), np.where(outside, -1, last)
+    row = np.arange(height)
+    first, last = np.maximum(columns[0], by_px), np.minimum(columns[1], width - 1 - by_px)
+    return _only((row >= by_px) & (row < height - by_px), first, last, width)
+
+
+def _only(where: Bits, first: NDArray[np.int64], last: NDArray[np.int64], width: int) -> Columns:
+    """The columns where `where` holds and some remain; elsewhere the empty run from `width` to -1."""
+    kept = where & (first <= last)
+    return np.where(kept, first, width), np.where(kept, last, -1)
 
 
 def window_of(columns: Columns) -> Window:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from build_model.enclosure import columns_that_may_be_lit
 from build_model.partition import partition
-from build_model.pixel_mask import Bits, Window, clip_and_widen, paint, window_of
+from build_model.pixel_mask import Bits, Window, paint, widened, window_of
 from runtime.camera import row_of_point
 from runtime.scene import Camera, Scene, SceneError
 from runtime.state_set import StateSet, contract, scale_range, tangent_of_row
@@ -48,10 +48,10 @@ def slice_cell(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float
 
 def spatial_filter(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> tuple[Bits, Window]:
     """S of the cell [lower, upper], both (4,): bits (rows, columns) in the window that is returned with them."""
-    columns = columns_that_may_be_lit(scene, slice_cell(scene, lower, upper))
-    widened = clip_and_widen(scene, columns, scene.tolerance.line_px)
-    window = window_of(widened)
-    return np.logical_or.reduce(paint(widened, window), axis=0), window
+    line_px = scene.tolerance.line_px
+    columns = widened(scene, columns_that_may_be_lit(scene, slice_cell(scene, lower, upper), line_px), line_px)
+    window = window_of(columns)
+    return np.logical_or.reduce(paint(columns, window), axis=0), window
 
 
 def spatial_filters(scene: Scene) -> Bits:

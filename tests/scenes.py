@@ -50,6 +50,9 @@ FREE_X = replace(
 """81 cells, three of them along x."""
 ONE_CELL = replace(PAPER, domain=Domain(Axis((0.6,), 0.1), Axis((0.1,), 0.0), Axis((0.9,), 0.1), Axis((1.7,), 0.1)))
 """Quick to build; its x is fixed at 0.1, which float32 cannot hold."""
+BARELY_ABOVE = seen_from(replace(ONE_CELL, runway=Runway((Marking("L", -0.1, 0.0, 0.3), Marking("R", 0.1, 0.2, 0.3)))), 320.0, 110.0)
+BARELY_BELOW = seen_from(replace(ONE_CELL, runway=Runway((Marking("L", -0.1, 0.0, 0.3), Marking("R", 0.1, 0.0, 0.1)))), 320.0, 520.0)
+"""In some states the right marking lies just above, or just below, the frame: a camera that is off brings it into view."""
 
 SCENES = {
     "paper": PAPER,
@@ -63,6 +66,8 @@ SCENES = {
     "tolerant": tolerant(PAPER, OFF_BY),
     "tolerant, cut left": tolerant(CUT_LEFT, SHIFTED),
     "tolerant, cut right": tolerant(CUT_RIGHT, SHIFTED),
+    "tolerant, barely above": tolerant(BARELY_ABOVE, SHIFTED),
+    "tolerant, barely below": tolerant(BARELY_BELOW, SHIFTED),
     "tolerant, free x": tolerant(replace(FREE_X, bank=replace(FREE_X.bank, pitch_bins=3)), SHIFTED),
 }
 """Scenes that have a model; `conftest.model_of` exports each when it is first asked for."""

@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scenes import CUT_LEFT, FREE_X, OFF_BY, PAPER, THREE_MARKINGS, UNLIKE_MARKINGS, Floats, tolerant
+from scenes import BARELY_ABOVE, BARELY_BELOW, CUT_LEFT, FREE_X, OFF_BY, PAPER, SHIFTED, THREE_MARKINGS, UNLIKE_MARKINGS, Floats, tolerant
 
 from build_model.hough_bank import CellBank, LineBoxes, cell_bank, line_boxes
 from build_model.partition import partition
-from runtime.camera import ground_scale, project_points
-from runtime.image import runway_image
+from runtime.camera import ground_scale, project, project_points
+from runtime.image import image_of_ends, runway_image
 from runtime.rounding import OUTWARD_PX, inverted
 from runtime.scene import Axis, Camera, Scene, SceneError, Tolerance
 
@@ -166,6 +166,25 @@ def test_the_tolerance_takes_what_a_shift_can_carry_out_of_the_frame() -> None:
             exact[:1] = exact[-1:] = exact[:, :1] = exact[:, -1:] = False
             assert (exact == wide).all()
     assert at_border > 0
+
+
+@pytest.mark.parametrize(("exact", "border", "down"), [(BARELY_ABOVE, 0, 1), (BARELY_BELOW, 480, -1)], ids=["above", "below"])
+def test_o_holds_what_a_shift_brings_into_the_frame(exact: Scene, border: int, down: int) -> None:
+    """The end of a marking that lies less than a pixel above the frame, or below it, where an exact camera does not show it."""
+    scene = tolerant(exact, SHIFTED)
+    lower, upper = scene.domain.lower, scene.domain.upper
+    bank = cell_bank(scene, lower, upper)
+    spatial, _, may = masks(bank)
+    states = states_of_cell(lower, upper, 60_000, 3)
+    beyond = down * (border - project(scene, states)[:, 1, :, 1])
+    states = states[((beyond > 0) & (beyond < 1)).any(axis=1)]
+    held = holding(scene, bank.lines, states)
+    for across in (-0.99, 0.99):
+        seen = image_of_ends(project(scene, states) + np.array([across, 0.99 * down]), scene.camera.shape).astype(bool)
+        cut = seen[:, *bank.window.slices]
+        assert (cut.sum(axis=(1, 2)) == seen.sum(axis=(1, 2))).all()
+        assert not (cut & ~spatial).any()
+        assert not any((lit & ~may[entries]).any() for lit, entries in zip(cut, held, strict=True))
 
 
 def test_a_pitch_that_ends_at_zero_loses_no_state() -> None:

@@ -11,44 +11,45 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scenes import PAPER
 
-from build_model.pixel_mask import Runs, Window, clip_and_widen, paint, runs_of, window_of
+from build_model.pixel_mask import Runs, Window, inset, paint, runs_of, widened, window_of
 from runtime.scene import Camera, Scene
 
 HEIGHT, WIDTH = 12, 16
 SMALL = replace(PAPER, camera=Camera(width=WIDTH, height=HEIGHT, focal_length_m=0.008, pixel_pitch_m=15e-6))
 FRAME = Window(0, HEIGHT, 0, WIDTH)
 BEYOND = 6
-"""Columns and rows around the frame that the naive twins paint too."""
+"""Columns on either side of the frame that the naive twin paints too."""
 Columns = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 
 @st.composite
-def markings(draw: st.DrawFn, sets: int = 2, count: int = 2) -> Columns:
-    """Columns of markings whose rows touch each other, some beyond the frame's sides, some absent."""
-    first, last = np.zeros((2, sets, count, HEIGHT), dtype=np.int64)
+def markings(draw: st.DrawFn, beyond: int = 0, sets: int = 2, count: int = 2) -> Columns:
+    """Columns of markings whose rows touch each other, some beyond the frame's sides, some absent; `beyond` more rows above and below."""
+    rows = HEIGHT + 2 * beyond
+    first, last = np.zeros((2, sets, count, rows), dtype=np.int64)
     last -= 1
     for index in np.ndindex(sets, count):
-        top, length = draw(st.integers(0, HEIGHT)), draw(st.integers(0, HEIGHT))
+        top, length = draw(st.integers(0, rows)), draw(st.integers(0, rows))
         left = draw(st.integers(-BEYOND, WIDTH + BEYOND - 1))
         right = left + draw(st.integers(0, 2))
-        for row in range(top, min(top + length, HEIGHT)):
+        for row in range(top, min(top + length, rows)):
             first[(*index, row)], last[(*index, row)] = left, right
             left, right = (lambda start, span: (start, start + span))(draw(st.integers(left - 1, right + 1)), draw(st.integers(0, 2)))
     return first, last
 
 
 def painted(columns: Columns, margin: int = 0) -> NDArray[np.bool_]:
-    """The double loop: bits (sets, rows, columns) of the frame within a margin."""
+    """The double loop: bits (sets, rows, columns), with `margin` more columns on either side of the frame."""
     first, last = columns
-    bits = np.zeros((len(first), HEIGHT + 2 * margin, WIDTH + 2 * margin), dtype=bool)
+    bits = np.zeros((len(first), first.shape[2], WIDTH + 2 * margin), dtype=bool)
     for index, marking, row in np.ndindex(first.shape):
         for column in range(first[index, marking, row], last[index, marking, row] + 1):
             if -margin <= column < WIDTH + margin:
-                bits[index, row + margin, column + margin] = True
+                bits[index, row, column + margin] = True
     return bits
 
 
-def widened(bits: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
+def dilated(bits: NDArray[np.bool_], radius: int) -> NDArray[np.bool_]:
     """The double loop: lit where a pixel within `radius` in the sup norm is lit."""
     result = np.zeros_like(bits)
     for index, row, column in np.argwhere(bits):
@@ -65,25 +66,27 @@ def test_paint_is_the_double_loop(columns: Columns, window: tuple[int, int, int,
 
 
 @settings(max_examples=60)
-@given(columns=markings(), radius=st.integers(0, 3))
-def test_widening_is_a_dilation_of_the_painted_bits(columns: Columns, radius: int) -> None:
-    """Of what lies beyond the frame's sides too; then the frame cuts it."""
+@given(radius_and_columns=st.integers(0, 3).flatmap(lambda radius: st.tuples(st.just(radius), markings(beyond=radius))))
+def test_widening_is_a_dilation_of_the_painted_bits(radius_and_columns: tuple[int, Columns]) -> None:
+    """Of what lies beyond the frame too; then the frame cuts it."""
+    radius, columns = radius_and_columns
     margin = BEYOND + 5
-    naive = widened(painted(columns, margin), radius)[:, margin:-margin, margin:-margin]
-    assert (paint(clip_and_widen(SMALL, columns, radius), FRAME) == naive).all()
+    naive = dilated(painted(columns, margin), radius)[:, radius : radius + HEIGHT, margin:-margin]
+    assert (paint(widened(SMALL, columns, radius), FRAME) == naive).all()
 
 
-@given(columns=markings(), inset=st.integers(1, 3))
-def test_a_negative_widening_keeps_off_the_frames_border(columns: Columns, inset: int) -> None:
-    naive = painted(columns)
-    naive[:, :inset] = naive[:, -inset:] = naive[:, :, :inset] = naive[:, :, -inset:] = False
-    assert (paint(clip_and_widen(SMALL, columns, -inset), FRAME) == naive).all()
+@given(columns=markings(), by_px=st.integers(0, 3))
+def test_an_inset_keeps_off_the_frames_border(columns: Columns, by_px: int) -> None:
+    naive = np.zeros((2, HEIGHT, WIDTH), dtype=bool)
+    inner = np.s_[:, by_px : HEIGHT - by_px, by_px : WIDTH - by_px]
+    naive[inner] = painted(columns)[inner]
+    assert (paint(inset(SMALL, columns, by_px), FRAME) == naive).all()
 
 
 @given(columns=markings())
 def test_the_window_is_the_smallest_that_holds_all(columns: Columns) -> None:
     bits = painted(columns).any(axis=0)
-    window = window_of(clip_and_widen(SMALL, columns, 0))
+    window = window_of(widened(SMALL, columns, 0))
     if not bits.any():
         assert window.shape == (0, 0)
         return
@@ -133,5 +136,4 @@ def test_an_empty_set_of_runs_has_sizes_of_zero() -> None:
 @pytest.mark.parametrize("scene", [SMALL], ids=["small"])
 def test_columns_outside_the_frame_are_dropped(scene: Scene) -> None:
     first = np.full((1, 1, HEIGHT), WIDTH + 3)
-    clipped = clip_and_widen(scene, (first, first + 1), 1)
-    assert not paint(clipped, FRAME).any()
+    assert not paint(widened(scene, (first, first + 1), 0), FRAME).any()

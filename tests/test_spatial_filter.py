@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scenes import CUT_BELOW, CUT_LEFT, FREE_X, PAPER, SHIFTED, THREE_MARKINGS, Floats, tolerant
+from scenes import BARELY_ABOVE, BARELY_BELOW, CUT_BELOW, CUT_LEFT, FREE_X, PAPER, SHIFTED, THREE_MARKINGS, Floats, tolerant
 
 from build_model.partition import partition
 from build_model.pixel_mask import Window
@@ -74,10 +74,12 @@ def test_s_is_close_to_the_sampled_union(cell: int) -> None:
     assert window.shape == bits.shape
 
 
-def test_a_tolerance_widens_s_and_holds_a_camera_that_is_off() -> None:
-    scene = tolerant(CUT_LEFT, SHIFTED)
+@pytest.mark.parametrize("exact_scene", [CUT_LEFT, BARELY_ABOVE, BARELY_BELOW], ids=["left", "above", "below"])
+def test_a_tolerance_widens_s_and_holds_a_camera_that_is_off(exact_scene: Scene) -> None:
+    """That brings into view what a border of the frame hides from an exact one."""
+    scene = tolerant(exact_scene, SHIFTED)
     cells = partition(scene)
-    filters, exact = spatial_filters(scene), spatial_filters(CUT_LEFT)
+    filters, exact = spatial_filters(scene), spatial_filters(exact_scene)
     assert not (exact & ~filters).any()
     for cell in range(0, len(cells), 5):
         ends = project(scene, states_of_cell(cells.lower[cell], cells.upper[cell], 200, cell))

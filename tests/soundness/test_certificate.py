@@ -22,7 +22,14 @@ from runtime.scene import Calibration, Scene
 EstimatorOf = Callable[..., Estimator]
 DENSITIES = (0.0, 0.01, 0.05, 0.2, 0.6, 1.0)
 EXACT = ("paper", "three markings", "unlike markings", "cut left", "cut right", "cut below", "free x", "one cell")
-TOLERANT = ("tolerant", "tolerant, cut left", "tolerant, cut right", "tolerant, free x")
+TOLERANT = (
+    "tolerant",
+    "tolerant, cut left",
+    "tolerant, cut right",
+    "tolerant, barely above",
+    "tolerant, barely below",
+    "tolerant, free x",
+)
 
 
 def check(estimator: Estimator, state: Floats, seen: Frame, clutter: Frame) -> Estimate:
@@ -190,7 +197,7 @@ def test_a_camera_off_by_its_calibration(estimator_of: EstimatorOf, name: str) -
         check(estimator, state, seen, random_clutter(rng, scene.camera.shape, (0.0, 0.02, 0.2)[number % 3]))
 
 
-@pytest.mark.parametrize("name", ["tolerant", "tolerant, cut left"])
+@pytest.mark.parametrize("name", ["tolerant", "tolerant, cut left", "tolerant, barely above", "tolerant, barely below"])
 @settings(max_examples=20)
 @given(data=st.data(), shares=st.lists(st.floats(-1, 1), min_size=5, max_size=5))
 def test_calibrations_that_hypothesis_finds(estimator_of: EstimatorOf, name: str, data: st.DataObject, shares: list[float]) -> None:
