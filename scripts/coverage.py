@@ -109,14 +109,14 @@ def code() -> list[Path]:
 
 
 def chunks_of(models: dict[str, Path], chosen: list[Scenario], frames: int, recording: Path | None, seed: int) -> list[Chunk]:
-    """The campaign's work, scenario by scenario."""
+    """The campaign's work: a chunk of every scenario by turns, so that one that is stopped has seen them all."""
     others = code() if recording is None else [*code(), recording]
     campaigns = {name: digest([path, *others]) + f"-{seed}" for name, path in models.items()}
     film = None if recording is None else str(recording)
     return [
         Chunk(scenario, str(models[scenario.model]), film, seed, first, min(CHUNK, frames - first), campaigns[scenario.model])
-        for scenario in chosen
         for first in range(0, frames, CHUNK)
+        for scenario in chosen
     ]
 
 
