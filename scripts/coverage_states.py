@@ -23,8 +23,8 @@ from runtime.camera import project
 Rng = np.random.Generator
 Floats = NDArray[np.float64]
 
-NUDGES = (0.0, 2.0**-60, 1e-15, 1e-12, 1e-9, 1e-6)
-"""Distances from a face or a border, rad or m: on it, below float64's spacing, just above it, and so on."""
+NUDGES = (2.0**-60, 1e-15, 1e-12, 1e-9, 1e-6)
+"""Distances from a face or a border, rad or m: below float64's spacing, just above it, and so on."""
 TRIES = 60
 """Draws of a state that must meet a condition, before one that does not is taken."""
 
@@ -135,12 +135,16 @@ def moved(state: RationalState, axis: int, to: Fraction) -> RationalState:
     return replace(state, **{("tangent", "x", "y", "z")[axis]: value})
 
 
+def nudge(rng: Rng) -> Fraction:
+    """Nothing, every second time; else a hair to one side."""
+    return Fraction(0) if rng.random() < 0.5 else Fraction(rng.choice([-1, 1]) * rng.choice(NUDGES))
+
+
 def on_faces(rng: Rng, stage: Stage) -> RationalState:
     """On a face, an edge or a corner of a cell, of the domain's among them, or a hair beside it."""
     state = uniform(rng, stage)
     for axis in some_free_axes(rng, stage):
-        nudge = Fraction(rng.choice([-1, 1]) * rng.choice(NUDGES))
-        state = moved(state, axis, Fraction(rng.choice(stage.scene.domain.axes[axis].edges)) + nudge)
+        state = moved(state, axis, Fraction(rng.choice(stage.scene.domain.axes[axis].edges)) + nudge(rng))
     return into_domain(stage, state)
 
 
@@ -149,8 +153,7 @@ def on_pixel_borders(rng: Rng, stage: Stage) -> RationalState:
     for _ in range(TRIES):
         state = solved_for_border(rng, stage, uniform(rng, stage))
         if state is not None:
-            nudge = Fraction(rng.choice([-1, 1]) * rng.choice(NUDGES))
-            state = replace(state, z=state.z + nudge) if rng.random() < 0.5 else replace(state, y=state.y + nudge)
+            state = replace(state, z=state.z + nudge(rng)) if rng.random() < 0.5 else replace(state, y=state.y + nudge(rng))
             if stage.contains(state):
                 return state
     return uniform(rng, stage)
@@ -187,7 +190,7 @@ def outside(rng: Rng, stage: Stage, by: float) -> RationalState:
     """Outside of one or more faces of the domain by up to `by`, often by a hair."""
     state = uniform(rng, stage)
     for axis in some_free_axes(rng, stage):
-        distance = Fraction(rng.choice([*NUDGES[1:], *rng.uniform(0, by, 3)]))
+        distance = Fraction(rng.choice([*NUDGES, *rng.uniform(0, by, 3)]))
         below = rng.random() < 0.5
         state = moved(state, axis, Fraction(stage.lower[axis]) - distance if below else Fraction(stage.upper[axis]) + distance)
     return state
