@@ -37,7 +37,7 @@ out/paper.onnx: models/paper.toml constraints.txt $(SOURCES) | $(INSTALLED)
 	$(BIN)/export-model $< -o $@
 
 evidence: out/paper.onnx
-	$(BIN)/python scripts/coverage.py $< --states 20000 -o out/coverage.json
+	$(BIN)/python scripts/coverage.py $< --frames 24000 -o out/coverage.json
 	$(BIN)/python -m pytest --hypothesis-profile=long
 
 clean:

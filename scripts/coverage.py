@@ -1,251 +1,232 @@
-"""Counts how often a certificate holds: random states, clutter, missed pixels, a camera off by its calibration.
+"""Counts how often a certificate holds: random and adversarial frames whose truth is known exactly.
 
-    python scripts/coverage.py [MODEL.onnx] [--states N] [--recording FILE] [-o FILE.json]
+    python scripts/coverage.py [MODEL.onnx] [--frames N] [--recording FILE] [-o FILE.json]
+    python scripts/coverage.py [the same options] --replay "SCENARIO#NUMBER"
 
-Every frame's truth is known: the runway's exact image (`runtime.image`) is joined with clutter, and pixels of it may be put out. One
-certified box without the truth in it, or one lit pixel of the runway that `filtered` loses, is a violation, and the exit code is 1.
+The runway's images are drawn in rational numbers by code that the build does not have (`rational_image`), the frames are those of
+`coverage_scenarios`, and `coverage_judge` says of which states a box must hold. One that does not, or one lit pixel of a judged runway that
+`filtered` loses, is a violation: it is written with what is needed to replay it, and the exit code is 1. Finished chunks are kept beside
+the output: the same command goes on where it was stopped, and begins anew if model, code, seed or recording are others.
 """
 
 from __future__ import annotations
 
-import functools
+import hashlib
 import json
-import math
+import os
 import sys
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated
 
 import joblib
-import numpy as np
 import typer
-from numpy.typing import NDArray
+from coverage_judge import HALF_WIDTHS, Tally, Violation, judge_frame, quantile
+from coverage_models import DERIVED, build_model
+from coverage_scenarios import Scenario, scenarios
+from coverage_states import Stage
 from rich.console import Console
-from rich.progress import track
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn, track
 from rich.table import Table
 
-from runtime import Estimator, Scene
-from runtime.camera import project
-from runtime.frames import events_to_frames
-from runtime.image import image_of_ends, runway_image
-from runtime.recording import read_events
-from runtime.scene import Calibration, EstimatorTraining, Tolerance
+import runtime
+from runtime import Estimator
 
 CHUNK = 250
-WINDOW_US = 40_000
-OFF_BY = Calibration(roll_rad=0.001, yaw_rad=0.0005, focal_relative=0.001, principal_px=0.2)
-Rng = np.random.Generator
+COUNTS = ("frames", "judged", "certified", "violations", "pixels_lost", "no_runway", "at_boundary", "named", "fallbacks", "unrefined")
 
 
 @dataclass(frozen=True)
-class Scenario:
-    """What is done to a frame. `clutter` is a density, a pair of them to draw from, or the path of a recording."""
+class Chunk:
+    """Frames `first` to `first + frames - 1` of a scenario."""
 
-    name: str
-    clutter: float | tuple[float, float] | str = 0.0
-    missed: int = 0
-    tolerant: bool = False
-    runway: bool = True
-    outside_by: float = 0.0
+    scenario: Scenario
+    path: str
+    recording: str | None
+    seed: int
+    first: int
+    frames: int
+    campaign: str
+    """Digest of all that the frames and their estimates depend on."""
 
+    @property
+    def key(self) -> tuple[str, str, int, int]:
+        """What a finished chunk is found again by."""
+        return self.campaign, self.scenario.name, self.first, self.frames
 
-@dataclass
-class Tally:
-    """Counts over the frames of a scenario, and the figures of each frame."""
-
-    frames: int = 0
-    certified: int = 0
-    violations: int = 0
-    pixels_lost: int = 0
-    no_runway: int = 0
-    flagged: int = 0
-    named: int = 0
-    fallbacks: int = 0
-    passing: tuple[int, ...] = ()
-    errors: tuple[float, ...] = ()
-    half_widths: tuple[tuple[float, ...], ...] = ()
-
-    def __add__(self, other: Tally) -> Tally:
-        return Tally(*(getattr(self, name) + getattr(other, name) for name in self.__dataclass_fields__))
+    def run(self) -> tuple[Chunk, Tally, list[Violation]]:
+        """Judges the frames."""
+        stage = Stage.of(self.path, self.recording)
+        tally, violations = Tally(), []
+        for number in range(self.first, self.first + self.frames):
+            counts, found = judge_frame(stage, self.scenario, self.seed, number)
+            tally += counts
+            violations += found
+        return self, tally, violations
 
 
-def scenarios(recording: str | None) -> Iterator[Scenario]:
-    """All that is measured, in the order of the table."""
-    for density in (0.0, 0.01, 0.02, 0.05, 0.2):
-        yield Scenario(f"clutter {density:.0%}", density)
-    if recording is not None:
-        yield Scenario("real clutter", recording)
-    yield Scenario("8 missed, clutter 2%", 0.02, missed=8)
-    yield Scenario("camera off, clutter 2%", 0.02, tolerant=True)
-    for missed in (0, 8):
-        yield Scenario(f"clutter alone 1-5%, m = {missed}", (0.01, 0.05), missed=missed, runway=False)
-    yield Scenario("outside the domain by up to 0.05", outside_by=0.05)
+class Journal:
+    """Finished chunks, one line of JSON each; what is not of this campaign is dropped."""
+
+    def __init__(self, path: Path, chunks: Iterable[Chunk]) -> None:
+        self.path = path
+        self.done: dict[tuple[str, str, int, int], tuple[Tally, list[Violation]]] = {}
+        wanted = {chunk.key for chunk in chunks}
+        kept = []
+        for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
+            try:
+                entry = json.loads(line)
+            except ValueError:  # the last line of a campaign that was killed
+                continue
+            key = (entry["campaign"], entry["scenario"], entry["first"], entry["frames"])
+            if key in wanted:
+                self.done[key] = Tally.read(entry["tally"]), [Violation(**each) for each in entry["violations"]]
+                kept.append(line)
+        beside = path.with_suffix(".part")
+        beside.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
+        beside.replace(path)
+
+    def add(self, chunk: Chunk, tally: Tally, violations: list[Violation]) -> None:
+        """Appends a finished chunk."""
+        campaign, scenario, first, frames = chunk.key
+        entry = {"campaign": campaign, "scenario": scenario, "first": first, "frames": frames}
+        entry |= {"tally": vars(tally), "violations": [asdict(each) for each in violations]}
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(entry) + "\n")
+        self.done[chunk.key] = tally, violations
 
 
-@functools.cache
-def estimator_of(path: str, missed_budget: int) -> Estimator:
-    """One loaded model a process and budget."""
-    return Estimator.load(path, missed_budget=missed_budget)
+def digest(paths: Iterable[Path]) -> str:
+    """One sha256 of the contents of files, in order."""
+    return hashlib.sha256("".join(hashlib.sha256(path.read_bytes()).hexdigest() for path in paths).encode()).hexdigest()
 
 
-@functools.cache
-def recorded_frames(path: str, shape: tuple[int, int]) -> NDArray[np.uint8]:
-    """The recording's 40 ms frames, (frames, height, width)."""
-    packets = list(read_events(path, shape))
-    return events_to_frames(np.concatenate(packets), shape, WINDOW_US)[1]
+def code() -> list[Path]:
+    """The files that decide what a frame is and what is said of it."""
+    here = Path(__file__).parent
+    return [*sorted(Path(runtime.__file__).parent.glob("*.py")), *sorted(here.glob("coverage*.py")), here / "rational_image.py"]
 
 
-def clutter(rng: Rng, scenario: Scenario, shape: tuple[int, int]) -> NDArray[np.uint8]:
-    """A frame of clutter: each pixel lit at random, or a frame of the recording, mirrored at random."""
-    if isinstance(scenario.clutter, str):
-        frames = recorded_frames(scenario.clutter, shape)
-        return frames[rng.integers(len(frames)), :: rng.choice([-1, 1]), :: rng.choice([-1, 1])]
-    density = rng.uniform(*scenario.clutter) if isinstance(scenario.clutter, tuple) else scenario.clutter
-    frame = np.zeros(math.prod(shape), dtype=np.uint8)
-    frame[rng.integers(frame.size, size=rng.binomial(frame.size, density))] = 1
-    return frame.reshape(shape)
+def chunks_of(models: dict[str, Path], chosen: list[Scenario], frames: int, recording: Path | None, seed: int) -> list[Chunk]:
+    """The campaign's work: a chunk of every scenario by turns, so that one that is stopped has seen them all."""
+    others = code() if recording is None else [*code(), recording]
+    campaigns = {name: digest([path, *others]) + f"-{seed}" for name, path in models.items()}
+    film = None if recording is None else str(recording)
+    return [
+        Chunk(scenario, str(models[scenario.model]), film, seed, first, min(CHUNK, frames - first), campaigns[scenario.model])
+        for first in range(0, frames, CHUNK)
+        for scenario in chosen
+    ]
 
 
-def draw_state(rng: Rng, scene: Scene, outside_by: float) -> NDArray[np.float64]:
-    """A state of the domain, or one that lies up to `outside_by` outside one of its faces."""
-    lower, upper = scene.domain.lower, scene.domain.upper
-    state = rng.uniform(lower, upper)
-    if outside_by:
-        axis = rng.choice(np.flatnonzero(upper > lower))
-        distance = rng.uniform(0, outside_by)
-        state[axis] = rng.choice([lower[axis] - distance, upper[axis] + distance])
-    return state
-
-
-def draw_image(rng: Rng, scene: Scene, state: NDArray[np.float64], scenario: Scenario) -> NDArray[np.uint8]:
-    """The runway as the camera shows it, which may be off by the calibration."""
-    if scenario.tolerant:
-        return image_of_ends(off_camera(rng, scene, project(scene, state)), scene.camera.shape)
-    return runway_image(scene, state)
-
-
-def off_camera(rng: Rng, scene: Scene, ends: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Ends as a camera sees them that is turned, zoomed and shifted by random amounts within the scene's calibration."""
-    camera, off = scene.camera, scene.calibration
-    roll, yaw, zoom = rng.uniform(-1, 1, 3) * (off.roll_rad, off.yaw_rad, off.focal_relative)
-    shift = rng.uniform(-1, 1, 2) * off.principal_px
-    centre = np.array([camera.u0, camera.v0])
-    rays = np.concatenate([(ends - centre) / camera.focal_px, np.ones((*ends.shape[:-1], 1))], axis=-1)
-    turn_yaw = np.array([[np.cos(yaw), 0, -np.sin(yaw)], [0, 1, 0], [np.sin(yaw), 0, np.cos(yaw)]])
-    turn_roll = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]])
-    seen = rays @ (turn_roll @ turn_yaw).T
-    return centre + shift + camera.focal_px * (1 + zoom) * seen[..., :2] / seen[..., 2:]
-
-
-def put_out(rng: Rng, image: NDArray[np.uint8], pixels: int) -> NDArray[np.uint8]:
-    """The image with exactly `pixels` of its lit pixels dark, or all of them if it has fewer."""
-    lit = np.flatnonzero(image)
-    dark = image.copy().ravel()
-    dark[rng.choice(lit, size=min(pixels, len(lit)), replace=False)] = 0
-    return dark.reshape(image.shape)
-
-
-def run_chunk(path: str, scenario: Scenario, seed: list[int], frames: int) -> Tally:
-    """`frames` random frames of a scenario."""
-    rng = np.random.default_rng(seed)
-    estimator = estimator_of(path, scenario.missed)
-    return sum((run_frame(rng, estimator, scenario) for _ in range(frames)), Tally())
-
-
-def run_frame(rng: Rng, estimator: Estimator, scenario: Scenario) -> Tally:
-    """One random frame, judged against its truth."""
-    scene = estimator.scene
-    state = draw_state(rng, scene, scenario.outside_by)
-    image = draw_image(rng, scene, state, scenario)
-    seen = put_out(rng, image, scenario.missed) if scenario.runway else np.zeros_like(image)
-    estimate = estimator.estimate(seen | clutter(rng, scenario, scene.camera.shape))
-    if estimate.box is None or estimate.state is None:
-        lost = scenario.runway and not scenario.outside_by
-        return Tally(frames=1, no_runway=1, violations=int(lost))
-    judged = scenario.runway and not scenario.outside_by
-    return Tally(
-        frames=1,
-        certified=1,
-        violations=int(judged and not estimate.box.contains(state)),
-        pixels_lost=int((seen > estimate.filtered).sum()) if judged else 0,
-        flagged=int(estimate.touches_boundary),
-        named=int(estimate.cell == cell_of(scene, state)) if judged else 0,
-        fallbacks=int(estimate.used_fallback),
-        passing=(len(estimate.passing),),
-        errors=(float(np.linalg.norm(estimate.state - state)),),
-        half_widths=(tuple(estimate.box.half_widths),),
-    )
-
-
-def cell_of(scene: Scene, state: NDArray[np.float64]) -> int:
-    """Number of the cell that holds a state of the domain."""
-    axes = scene.domain.axes
-    index = [int(np.searchsorted(axis.edges[1:-1], value)) for axis, value in zip(axes, state, strict=True)]
-    return int(np.ravel_multi_index(index, [len(axis.centres) for axis in axes]))
-
-
-def tolerant_model(scene: Scene, folder: Path) -> Path:
-    """A model of the same scene whose camera may be off by `OFF_BY`, with a tolerance of 1 px that covers it."""
-    from build_model.export import export_model
-
-    path = folder / "coverage-tolerant.onnx"
-    tolerance = Tolerance(line_px=1, missed_budget=scene.tolerance.missed_budget)
-    quick = EstimatorTraining(training_frames=256, epochs=1)
-    export_model(replace(scene, tolerance=tolerance, calibration=OFF_BY, estimator=quick), path, jobs=2)
-    return path
+def run_campaign(chunks: list[Chunk], journal: Journal, jobs: int) -> None:
+    """Runs what the journal does not have yet, and enters it as it is finished."""
+    missing = [chunk for chunk in chunks if chunk.key not in journal.done]
+    found_so_far = TextColumn("{task.fields[violations]} violations")
+    columns = (TextColumn("frames"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), found_so_far)
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        found = sum(len(violations) for _, violations in journal.done.values())
+        done = sum(chunk.frames for chunk in chunks) - sum(chunk.frames for chunk in missing)
+        task = bar.add_task("frames", total=sum(chunk.frames for chunk in chunks), completed=done, violations=found)
+        results = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")(joblib.delayed(Chunk.run)(chunk) for chunk in missing)
+        for chunk, tally, violations in results:  # pyright: ignore[reportGeneralTypeIssues]
+            journal.add(chunk, tally, violations)
+            found += len(violations)
+            bar.update(task, advance=chunk.frames, violations=found)
 
 
 def table(results: dict[str, Tally]) -> Table:
     """The results as a table for people."""
     view = Table(title="Coverage", title_justify="left")
-    headings = ("scenario", "frames", "certified", "violations", "pixels lost", "no runway", "at boundary", "cells", "named", "fallback")
-    for heading in (*headings, "half-widths θ y z", "error 50 %", "95 %"):
+    headings = ("scenario", "frames", "judged", "certified", "violations", "pixels lost", "no runway", "at boundary", "cells", "named")
+    for heading in (*headings, "fallback", "half-widths θ y z", "error 50 %", "95 %"):
         view.add_column(heading, justify="right" if heading != "scenario" else "left")
-    for name, tally in results.items():
+    for name, tally in (*results.items(), ("all", sum(results.values(), Tally()))):
         certified = max(tally.certified, 1)
-        middle = np.median(np.array(tally.half_widths), axis=0)[[0, 2, 3]] if tally.half_widths else []
-        quantiles = np.quantile(tally.errors, [0.5, 0.95]) if tally.errors else []
-        row = [name, tally.frames, tally.certified, tally.violations, tally.pixels_lost, f"{tally.no_runway / tally.frames:.2%}"]
-        row += [f"{tally.flagged / certified:.1%}", f"{np.mean(tally.passing or [0]):.2f}", f"{tally.named / certified:.1%}"]
-        row += [tally.fallbacks, " ".join(f"{value:.4f}" for value in middle), *(f"{value:.4f}" for value in quantiles)]
-        view.add_row(*map(str, row))
+        row = [name, tally.frames, tally.judged, tally.certified, tally.violations, tally.pixels_lost]
+        row += [f"{tally.no_runway / tally.frames:.2%}", f"{tally.at_boundary / certified:.1%}", f"{tally.passing / certified:.2f}"]
+        row += [f"{tally.named / certified:.1%}", tally.fallbacks]
+        row += [" ".join(f"{quantile(getattr(tally, axis), 0.5):.4f}" for axis in HALF_WIDTHS)]
+        row += [f"{quantile(tally.error, level):.4f}" for level in (0.5, 0.95)]
+        view.add_row(*map(str, row), end_section=name == list(results)[-1])
     return view
-
-
-def main(
-    model: Annotated[Path, typer.Argument(help="Model to test.")] = Path("models/paper.onnx"),
-    states: Annotated[int, typer.Option(help="Frames a scenario.")] = 20_000,
-    recording: Annotated[Path | None, typer.Option(help="Event recording whose frames serve as clutter.")] = None,
-    output: Annotated[Path, typer.Option("-o", "--output", help="JSON file for the counts.")] = Path("out/coverage.json"),
-    seed: Annotated[int, typer.Option(help="Seed of all frames.")] = 1,
-    jobs: Annotated[int, typer.Option(help="Processes.")] = 2,
-) -> None:
-    """Run every scenario and print the table."""
-    output.parent.mkdir(parents=True, exist_ok=True)
-    tolerant = tolerant_model(Estimator.load(model).scene, output.parent)
-    work: list[tuple[str, Any]] = []
-    for number, scenario in enumerate(scenarios(None if recording is None else str(recording))):
-        path = str(tolerant if scenario.tolerant else model)
-        for chunk in range(math.ceil(states / CHUNK)):
-            frames = min(CHUNK, states - chunk * CHUNK)
-            work.append((scenario.name, joblib.delayed(run_chunk)(path, scenario, [seed, number, chunk], frames)))
-    results: dict[str, Tally] = {}
-    tallies = joblib.Parallel(n_jobs=jobs, return_as="generator")(job for _, job in work)
-    for (name, _), tally in zip(work, track(iter(tallies), total=len(work), description="frames"), strict=True):
-        results[name] = results.get(name, Tally()) + cast(Tally, tally)
-    Console(width=200).print(table(results))
-    output.write_text(json.dumps({name: summary(tally) for name, tally in results.items()}, indent=2))
-    if any(tally.violations or tally.pixels_lost for tally in results.values()):
-        sys.exit(1)
 
 
 def summary(tally: Tally) -> dict[str, object]:
     """Counts and quantiles of a scenario, for JSON."""
-    lists = ("passing", "errors", "half_widths")
-    counts = {name: value for name, value in asdict(replace(tally, passing=(), errors=(), half_widths=())).items() if name not in lists}
-    quantiles = {f"{level:.0%}": value for level, value in zip((0.5, 0.95), np.quantile(tally.errors or [0], (0.5, 0.95)), strict=True)}
-    return {**counts, "mean_passing": float(np.mean(tally.passing or [0])), "error_quantiles": quantiles}
+    half_widths = {axis: quantile(getattr(tally, axis), 0.5) for axis in HALF_WIDTHS}
+    errors = {f"{level:.0%}": quantile(tally.error, level) for level in (0.5, 0.95)}
+    cells = tally.passing / max(tally.certified, 1)
+    counts = {name: getattr(tally, name) for name in COUNTS}
+    return {**counts, "mean_passing": cells, "half_width_medians": half_widths, "error_quantiles": errors}
+
+
+def report(chunks: list[Chunk], journal: Journal, output: Path) -> int:
+    """Writes the JSON, prints the table and the violations, and returns how many there are."""
+    results: dict[str, Tally] = {}
+    violations: list[Violation] = []
+    for chunk in chunks:
+        tally, found = journal.done[chunk.key]
+        results[chunk.scenario.name] = results.get(chunk.scenario.name, Tally()) + tally
+        violations += found
+    Console(width=220).print(table(results))
+    for each in violations[:20]:
+        print(f'{each.fault}\n    state {each.state}\n    --seed {each.seed} --replay "{each.scenario}#{each.number}"')
+    tables = {"scenarios": {name: summary(tally) for name, tally in results.items()}, "violations": [asdict(each) for each in violations]}
+    beside = output.with_suffix(".part.json")
+    beside.write_text(json.dumps(tables, indent=2), encoding="utf-8")
+    beside.replace(output)
+    return len(violations)
+
+
+def named(text: str, chosen: list[Scenario]) -> tuple[Scenario, int]:
+    """The scenario and the number of a frame given as "SCENARIO#NUMBER"."""
+    name, _, number = text.rpartition("#")
+    scenario = next((each for each in chosen if each.name == name), None)
+    if scenario is None or not number.isdecimal():
+        raise typer.BadParameter(f'found {text!r}; give "SCENARIO#NUMBER" as the report of a violation does')
+    return scenario, int(number)
+
+
+def replay(chunk: Chunk) -> int:
+    """Draws and judges a chunk's frames again, prints what is found, and returns the number of violations."""
+    _, tally, violations = chunk.run()
+    print(f"{tally.judged} states judged, {len(violations)} violations")
+    for each in violations:
+        print(f"{each.fault}\n    state {each.state}")
+    return len(violations)
+
+
+def main(
+    model: Annotated[Path, typer.Argument(help="Model to test.")] = Path("models/paper.onnx"),
+    frames: Annotated[int, typer.Option(min=1, help="Frames a scenario.")] = 2000,
+    recording: Annotated[Path | None, typer.Option(help="Event recording whose frames serve as clutter.")] = None,
+    output: Annotated[Path, typer.Option("-o", "--output", help="JSON file for the counts.")] = Path("out/coverage.json"),
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all frames.")] = 1,
+    jobs: Annotated[int, typer.Option(help="Processes.")] = 2,
+    replay_frame: Annotated[str | None, typer.Option("--replay", help='One frame again: "SCENARIO#NUMBER".')] = None,
+) -> None:
+    """Run every scenario, or what is left of an earlier run, and print the table."""
+    output.parent.mkdir(parents=True, exist_ok=True)
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    given = Estimator.load(model)
+    chosen = list(scenarios(recording is not None, given.metadata["smallest_must_light"] - 1))
+    if replay_frame is not None:
+        scenario, number = named(replay_frame, chosen)
+        path = model if scenario.model == "given" else build_model(given.scene, scenario.model, output.parent, jobs)
+        sys.exit(int(replay(Chunk(scenario, str(path), None if recording is None else str(recording), seed, number, 1, "")) > 0))
+    models = {"given": model}
+    for name in track(DERIVED, "models", console=Console(stderr=True)):
+        models[name] = build_model(given.scene, name, output.parent, jobs)
+    chunks = chunks_of(models, chosen, frames, recording, seed)
+    journal = Journal(output.with_suffix(".chunks.jsonl"), chunks)
+    try:
+        run_campaign(chunks, journal, jobs)
+    except KeyboardInterrupt:
+        print(f"stopped: {len(journal.done)} of {len(chunks)} chunks are kept in {journal.path}; the same command goes on", file=sys.stderr)
+        sys.exit(130)
+    sys.exit(int(report(chunks, journal, output) > 0))
 
 
 if __name__ == "__main__":

@@ -1,0 +1,100 @@
+"""The models of the coverage campaign: the one given, the same with a tolerance, and some whose frame's border cuts the runway."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from rational_image import RationalState, RationalView
+
+from build_model.export import export_model
+from build_model.partition import partition
+from runtime import Scene
+from runtime.scene import Axis, Calibration, EstimatorTraining, Runway, Tolerance
+
+OFF_BY = Calibration(roll_rad=0.001, yaw_rad=0.0005, focal_relative=0.001, principal_px=0.2)
+SHIFTED = Calibration(principal_px=0.99)
+"""Uses a tolerance of 1 px up in one shift, which takes the most out of view, or into it."""
+LEFT_IN_VIEW_PX = 15
+"""Rows of each marking that are in view at the state that shows the fewest."""
+MISSED_BY_PX = 0.3
+"""By how much the frame misses a marking in the state that comes closest to showing it: less than a camera may be off by."""
+SMALL_CELL = 8
+"""How many times smaller a cell is in which a whole marking stays out of view."""
+SIDES = ("left", "top", "bottom")
+BARELY = ("barely above", "barely below")
+DERIVED = ("tolerant", *(f"cut {side}{also}" for side in SIDES for also in ("", ", tolerant")), *BARELY)
+"""Names of the models that are built."""
+UNTRAINED = EstimatorTraining(training_frames=256, epochs=1)
+"""NN_e is not certified: one epoch gives it a shape."""
+
+
+def derived_scene(scene: Scene, name: str) -> Scene:
+    """The scene of one of `DERIVED`."""
+    exact = replace(scene, estimator=UNTRAINED, calibration=Calibration(), tolerance=Tolerance())
+    if name == "tolerant":
+        return replace(exact, calibration=OFF_BY, tolerance=Tolerance(line_px=1))
+    side, _, also = name.removeprefix("cut ").partition(", ")
+    cut = staggered_scene(exact, above=name == BARELY[0]) if name in BARELY else cut_scene(exact, side)
+    return replace(cut, calibration=SHIFTED, tolerance=Tolerance(line_px=1)) if also or name in BARELY else cut
+
+
+def build_model(scene: Scene, name: str, folder: Path, jobs: int) -> Path:
+    """Writes one of `DERIVED` to `folder` and returns its path. The same scene and versions give the same file."""
+    path = folder / f"coverage-{name.replace(', ', '-').replace(' ', '-')}.onnx"
+    export_model(derived_scene(scene, name), path, jobs=jobs)
+    return path
+
+
+def cut_scene(scene: Scene, side: str) -> Scene:
+    """Up to two cells an axis, and the principal point so moved that the left, top or bottom border of the frame cuts the runway.
+
+    Top and bottom leave `LEFT_IN_VIEW_PX` rows to the state that shows the fewest; the left border runs through the leftmost marking.
+    """
+    down = side == "bottom"
+    picks = (down, None, not down, down)
+    axes = [few_cells(axis, first) for axis, first in zip(scene.domain.axes, picks, strict=True)]
+    scene = replace(scene, domain=replace(scene.domain, theta_rad=axes[0], x_m=axes[1], y_m=axes[2], z_m=axes[3]))
+    ends = corner_ends(scene)
+    if side != "left":
+        rows = ends[..., 1]
+        kept = scene.camera.height - LEFT_IN_VIEW_PX
+        return moved_down(scene, round(kept - rows[:, :, 1].max() if down else LEFT_IN_VIEW_PX - rows[:, :, 0].min()))
+    leftmost = ends[:, scene.runway.x_m.argmin(), :, 0]
+    u0 = scene.camera.u0 - round((leftmost.min() + leftmost.max()) / 2)
+    return replace(scene, camera=replace(scene.camera, principal_point=(u0, scene.camera.v0)))
+
+
+def staggered_scene(scene: Scene, above: bool) -> Scene:
+    """One small cell, none of whose states shows the last marking, which lies beyond the others or is shorter: one misses it by little."""
+    axes = [Axis(few_cells(axis, None).centres, axis.width / SMALL_CELL) for axis in scene.domain.axes]
+    *others, last = scene.runway.markings
+    third = last.length_m / 3
+    moved = replace(last, start_z_m=last.start_z_m + 2 * third) if above else replace(last, length_m=third)
+    domain = replace(scene.domain, theta_rad=axes[0], x_m=axes[1], y_m=axes[2], z_m=axes[3])
+    scene = replace(scene, domain=domain, runway=Runway((*others, moved)))
+    rows = corner_ends(scene)[:, -1, :, 1]
+    return moved_down(scene, -MISSED_BY_PX - rows[:, 0].max() if above else scene.camera.height + MISSED_BY_PX - rows[:, 1].min())
+
+
+def moved_down(scene: Scene, by_px: float) -> Scene:
+    """The scene with its principal point farther down."""
+    return replace(scene, camera=replace(scene.camera, principal_point=(scene.camera.u0, scene.camera.v0 + by_px)))
+
+
+def few_cells(axis: Axis, first: bool | None) -> Axis:
+    """The first or the last two cells of an axis; the middle one, or the one there is, where it does not matter."""
+    if first is None:
+        return Axis(axis.centres[len(axis.centres) // 2 :][:1], axis.width)
+    return Axis(axis.centres[:2] if first else axis.centres[-2:], axis.width)
+
+
+def corner_ends(scene: Scene) -> NDArray[np.float64]:
+    """The ends of all markings at all corners of all cells, (corners, markings, 2, 2) px: near and far end, (u, v)."""
+    view, cells = RationalView.of(scene.to_dict()), partition(scene)
+    sides = [np.unique([cells.lower[:, axis], cells.upper[:, axis]]) for axis in range(4)]
+    corners = np.stack(np.meshgrid(*sides, indexing="ij"), axis=-1).reshape(-1, 4)
+    states = (RationalState.near(corner) for corner in corners)
+    return np.array([[[[float(value) for value in point] for point in segment] for segment in view.segments(state)] for state in states])

@@ -1,0 +1,202 @@
+"""The image of a state in rational numbers: a second, independent reading of the camera equations and of a lit pixel.
+
+Where tan(theta/2) is rational, so are cos(theta) = (1 - t^2)/(1 + t^2) and sin(theta) = 2t/(1 + t^2), and with rational x, y and z every
+end of a marking is projected without any rounding:
+
+    X = p_x - x        down = y cos(theta) - d sin(theta)        Z = y sin(theta) + d cos(theta),        d = p_z + z
+    u = u0 + F X/Z     v = v0 + F down/Z
+
+A camera that is off is turned by rational half-angle tangents too: first yawed, then rolled. A pixel is lit if a point of a closed
+segment lies in it; pixels are half-open, so that a point on the border of two belongs to the right or the lower one. Nothing here is
+shared with the packages that build and run a model: the scene comes as the plain tables of its file, whose float64 are taken exactly.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+import flint
+import numpy as np
+from numpy.typing import NDArray
+
+Frame = NDArray[np.bool_]
+Point = tuple[Fraction, Fraction]
+
+SURE_RAD = 1e-12
+"""Angles farther apart than this are told apart by float64, whose atan is right to some 1e-16."""
+FIRST_BITS = 128
+
+
+def turn(half_tangent: Fraction) -> tuple[Fraction, Fraction]:
+    """Cosine and sine of the angle whose half has this tangent."""
+    square = half_tangent**2
+    return (1 - square) / (1 + square), 2 * half_tangent / (1 + square)
+
+
+@dataclass(frozen=True)
+class RationalState:
+    """A state [theta, x, y, z] given by tan(theta/2) and by x, y, z in m."""
+
+    tangent: Fraction
+    x: Fraction
+    y: Fraction
+    z: Fraction
+
+    @staticmethod
+    def near(floats: Sequence[float] | NDArray[np.float64]) -> RationalState:
+        """The rational state at [theta, x, y, z], (4,): theta within float64's spacing, the lengths exactly."""
+        theta, x, y, z = map(float, floats)
+        return RationalState(Fraction(math.tan(theta / 2)), Fraction(x), Fraction(y), Fraction(z))
+
+    @property
+    def floats(self) -> NDArray[np.float64]:
+        """[theta, x, y, z], (4,), rounded to float64."""
+        return np.array([2 * math.atan(self.tangent), self.x, self.y, self.z], dtype=np.float64)
+
+    def within(self, lower: Sequence[float] | NDArray[np.float64], upper: Sequence[float] | NDArray[np.float64]) -> bool:
+        """True if the state lies in the box [lower, upper], (4,) float64 each, borders included: decided exactly."""
+        lengths = zip((self.x, self.y, self.z), map(float, lower[1:]), map(float, upper[1:]), strict=True)
+        if not all(low <= value <= high for value, low, high in lengths):  # Fraction and float are compared exactly
+            return False
+        return angle_is_at_least(self.tangent, float(lower[0])) and angle_is_at_least(-self.tangent, -float(upper[0]))
+
+    def __str__(self) -> str:
+        return " ".join(map(str, (self.tangent, self.x, self.y, self.z)))
+
+
+def angle_is_at_least(half_tangent: Fraction, bound_rad: float) -> bool:
+    """True if 2 atan(half_tangent) >= bound_rad, decided exactly: by balls of more and more bits where float64 cannot tell.
+
+    It ends: but for 0, the atan of a rational number is transcendental, and so is no float64.
+    """
+    nearly = 2 * math.atan(half_tangent) - bound_rad
+    if abs(nearly) > SURE_RAD:
+        return nearly > 0
+    bits = FIRST_BITS
+    while True:
+        with flint.ctx.workprec(bits):
+            angle = 2 * (flint.arb(half_tangent.numerator) / half_tangent.denominator).atan()
+            if angle >= bound_rad:
+                return True
+            if angle < bound_rad:
+                return False
+        bits *= 2
+
+
+@dataclass(frozen=True)
+class Stripe:
+    """A marking: the segment from (x, 0, near_z) to (x, 0, far_z), m."""
+
+    x: Fraction
+    near_z: Fraction
+    far_z: Fraction
+
+
+@dataclass(frozen=True)
+class RunwayImage:
+    """Lit pixels, as a frame (height, width) and as rows and columns in the order of the frame, all read-only."""
+
+    frame: Frame
+    rows: NDArray[np.int64]
+    columns: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        for array in (self.frame, self.rows, self.columns):
+            array.flags.writeable = False
+
+    @property
+    def flat(self) -> NDArray[np.int64]:
+        """Numbers of the pixels in the flattened frame, ascending."""
+        return self.rows * self.frame.shape[1] + self.columns
+
+    def thickened(self, reach: int) -> Frame:
+        """A frame in which everything is lit that lies within `reach` rows and columns of a pixel."""
+        thick = np.zeros_like(self.frame)
+        for row, column in zip(self.rows.tolist(), self.columns.tolist(), strict=True):
+            thick[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1] = True
+        return thick
+
+
+@dataclass(frozen=True)
+class RationalView:
+    """A camera and what it looks at. `roll` and `yaw` are the tangents of half the angles by which the camera is off."""
+
+    width: int
+    height: int
+    focal: Fraction
+    u0: Fraction
+    v0: Fraction
+    stripes: tuple[Stripe, ...]
+    roll: Fraction = Fraction(0)
+    yaw: Fraction = Fraction(0)
+
+    @staticmethod
+    def of(tables: dict[str, Any]) -> RationalView:
+        """The view of a scene's tables, as a scene file or a model's metadata have them."""
+        camera = tables["camera"]
+        u0, v0 = camera.get("principal_point") or (Fraction(camera["width"], 2), Fraction(camera["height"], 2))
+        stripes = []
+        for marking in tables["runway"]["markings"]:
+            start = Fraction(marking["start_z_m"])
+            stripes.append(Stripe(Fraction(marking["x_m"]), start, start + Fraction(marking["length_m"])))
+        focal = Fraction(camera["focal_length_m"]) / Fraction(camera["pixel_pitch_m"])
+        return RationalView(camera["width"], camera["height"], focal, Fraction(u0), Fraction(v0), tuple(stripes))
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width) of a frame."""
+        return self.height, self.width
+
+    def project(self, state: RationalState, p_x: Fraction, p_z: Fraction) -> Point:
+        """(u, v) of the ground point (p_x, 0, p_z), px. Raises ValueError where it is not in front of the camera."""
+        cosine, sine = turn(state.tangent)
+        ahead = p_z + state.z
+        right, down, depth = p_x - state.x, state.y * cosine - ahead * sine, state.y * sine + ahead * cosine
+        if self.yaw:
+            cosine, sine = turn(self.yaw)
+            right, depth = right * cosine - depth * sine, right * sine + depth * cosine
+        if self.roll:
+            cosine, sine = turn(self.roll)
+            right, down = right * cosine - down * sine, right * sine + down * cosine
+        if depth <= 0:
+            raise ValueError("the point lies behind the camera")
+        return self.u0 + self.focal * right / depth, self.v0 + self.focal * down / depth
+
+    def segments(self, state: RationalState) -> list[tuple[Point, Point]]:
+        """The near and the far end of each marking in the image."""
+        return [(self.project(state, stripe.x, stripe.near_z), self.project(state, stripe.x, stripe.far_z)) for stripe in self.stripes]
+
+    def image(self, state: RationalState) -> RunwayImage:
+        """Every pixel of the frame that a marking meets."""
+        frame = np.zeros(self.shape, dtype=np.bool_)
+        pixels = set()
+        for start, stop in self.segments(state):
+            for row, first, last in lit_columns(start, stop, self.height):
+                pixels.update((row, column) for column in range(max(first, 0), min(last, self.width - 1) + 1))
+        rows, columns = np.array(sorted(pixels), dtype=np.int64).reshape(-1, 2).T
+        frame[rows, columns] = True
+        return RunwayImage(frame, rows, columns)
+
+
+def lit_columns(start: Point, stop: Point, height: int) -> Iterator[tuple[int, int, int]]:
+    """(row, first column, last column) of the pixels that a closed segment meets, for rows 0 to height - 1, exactly.
+
+    In row r lie the points with r <= v < r + 1. On a line u = base + slope v all columns are quotients of integers with one denominator.
+    """
+    (u_top, v_top), (u_bottom, v_bottom) = sorted((start, stop), key=lambda point: point[1])
+    slope = (u_bottom - u_top) / (v_bottom - v_top) if v_bottom > v_top else Fraction(0)
+    base = u_top - slope * v_top
+    common = math.lcm(base.denominator, slope.denominator, u_top.denominator, u_bottom.denominator)
+    base_units, slope_units, top_units, bottom_units = (int(value * common) for value in (base, slope, u_top, u_bottom))
+    first_row, last_row = math.floor(v_top), math.floor(v_bottom)
+    for row in range(max(first_row, 0), min(last_row, height - 1) + 1):
+        enters = top_units if row == first_row else base_units + slope_units * row
+        leaves = bottom_units if row == last_row else base_units + slope_units * (row + 1)
+        last = max(enters, leaves)
+        if row < last_row and leaves > enters:
+            last -= 1  # the point on the row's lower border belongs to the next row: the largest unit short of it
+        yield row, min(enters, leaves) // common, last // common
