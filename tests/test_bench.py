@@ -121,10 +121,10 @@ def test_a_missing_model_is_one_line_and_exit_code_2(tmp_path: Path) -> None:
 
 CONTROL_FLOW = {"If", "Loop", "Scan", "SequenceMap"}
 LARGEST_FILE = 4_000_000
-MOST_NODES = 140
+MOST_NODES = 115
 MOST_LOOK_UPS = 55_000
-MOST_BYTES_READ = 1_500_000
-MOST_BYTES_WRITTEN = 2_200_000
+MOST_BYTES_READ = 1_100_000
+MOST_BYTES_WRITTEN = 1_600_000
 
 
 @pytest.fixture(scope="module")
