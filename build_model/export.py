@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib import metadata as distributions
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import joblib
 import numpy as np
@@ -34,7 +34,7 @@ from build_model.filter_graph import IR_VERSION, OPSET, GraphWriter, filter_grap
 from build_model.filter_network import FilterTables, assemble
 from build_model.hough_bank import CellBank, cell_bank
 from build_model.partition import partition
-from build_model.reachability import paper_bound
+from build_model.reachability import PaperBound, paper_bound
 from build_model.state_network import TrainingReport, state_graph, train_state_network
 from runtime.model_file import FORMAT_VERSION, METADATA_KEY, metadata_digest
 from runtime.rounding import OUTWARD_PX
@@ -112,7 +112,8 @@ def export_model(
         network, report = _state_network(scene, filter_part, estimator, seed, progress)
     with watch.stage("file"):
         graph = _joined(filter_part, network)
-        content = _serialised(graph, _metadata(scene, tables, graph, shift_px, report, seed))
+        bounds = paper_bounds(scene, jobs, dask)
+        content = _serialised(graph, _metadata(scene, tables, graph, shift_px, bounds, report, seed))
         write_atomically(Path(path), content)
     return ExportReport(
         cells=len(banks),
@@ -141,6 +142,14 @@ def build_banks(scene: Scene, jobs: int = 1, progress: Progress = _silent, dask:
             banks.append(bank)
             progress("cells", len(banks), len(cells), None)
     return banks
+
+
+def paper_bounds(scene: Scene, jobs: int = 1, dask: str | None = None) -> list[PaperBound | None]:
+    """The paper's bound of every cell, in the order of the partition, by the workers of `build_banks`. Raises `ClusterError`."""
+    cells = partition(scene)
+    work = (joblib.delayed(paper_bound)(scene, lower, upper) for lower, upper in zip(cells.lower, cells.upper, strict=True))
+    with _workers(jobs, dask):
+        return [cast(PaperBound | None, bound) for bound in joblib.Parallel(return_as="generator")(work)]
 
 
 @contextmanager
@@ -250,9 +259,14 @@ def _bare(network: onnx.GraphProto) -> onnx.GraphProto:
 
 
 def _metadata(
-    scene: Scene, tables: FilterTables, graph: onnx.GraphProto, shift_px: float, report: TrainingReport | None, seed: int
+    scene: Scene,
+    tables: FilterTables,
+    graph: onnx.GraphProto,
+    shift_px: float,
+    bounds: list[PaperBound | None],
+    report: TrainingReport | None,
+    seed: int,
 ) -> dict[str, Any]:
-    bounds = [paper_bound(scene, lower, upper) for lower, upper in zip(tables.cells.lower, tables.cells.upper, strict=True)]
     return {
         "format_version": FORMAT_VERSION,
         "scene": scene.to_dict(),

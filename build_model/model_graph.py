@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 from build_model.cell_proof import demand
-from build_model.filter_graph import IR_VERSION, OPSET, filter_graph
+from build_model.filter_graph import BIT, IR_VERSION, OPSET, filter_graph
 from build_model.filter_network import FilterTables
 from build_model.partition import Partition
 from build_model.pixel_mask import Window
 from build_model.run_table import RunTable, SpatialRuns
-from runtime.scene import Scene
+from runtime.scene import STATE_NAMES, Scene
 
 Part = onnx.NodeProto | onnx.ValueInfoProto
 NETWORK_PREFIX = "state_network/"
@@ -53,37 +53,43 @@ class _Constants:
 def read_tables(graph: onnx.GraphProto, cells: Partition) -> FilterTables:
     """NN_F's tables from the initialisers. Raises `Refuted` if one is missing, or not of a shape that fits the others."""
     constants = _Constants(graph)
-    size = constants.read("must_light_size", np.int32, len(cells), -1)
-    entries = size.shape[1]
-    demand(entries > 0, "graph: the bank has no entry")
+    row_cell = constants.read("row_cell", np.int32, -1)
+    ascending = bool((np.diff(row_cell) >= 0).all()) and np.array_equal(np.unique(row_cell), np.arange(len(cells)))
+    demand(ascending, "graph: row_cell does not number the cells from 0 in their order")
+    size = constants.read("must_light_size", np.int32, len(row_cell), -1)
+    rows, width = size.shape
+    demand(width > 0, "graph: the bank has no entry")
     (top, left), (bottom, right) = (constants.read(name, np.int64, 2).tolist() for name in ("window_first", "window_stop"))
     window = Window(top, bottom, left, right)
     painted = SpatialRuns(*(constants.read(f"spatial_run_{name}", np.int32, -1) for name in ("cell", "index", "step")))
     same = painted.cell.shape == painted.index.shape == painted.step.shape
     known = bool(((painted.cell >= 0) & (painted.cell < len(cells))).all())
     demand(same and known, "graph: the constants spatial_run_* do not fit each other or the cells")
-    lower, upper = (constants.read(f"state_{side}", np.float32, 4, len(cells), entries).transpose(1, 2, 0) for side in ("lower", "upper"))
-    line_lower, line_upper = (constants.read(f"line_{side}", np.float64, len(cells), entries, 4) for side in ("lower", "upper"))
+    lower, upper = (
+        np.stack([constants.read(f"{name}_{side}", np.float32, rows, width) for name in STATE_NAMES], axis=-1)
+        for side in ("lower", "upper")
+    )
+    line_lower, line_upper = (constants.read(f"line_{side}", np.float64, rows, width, 4) for side in ("lower", "upper"))
     return FilterTables(
         window=window,
         cells=cells,
-        entries=entries,
-        runs=_read_runs(constants, window, (len(cells), entries)),
+        row_cell=row_cell,
+        runs=_read_runs(constants, window, len(cells), (rows, width)),
         spatial_runs=painted,
         must_light_size=size,
         state_lower=lower,
         state_upper=upper,
         line_lower=line_lower,
         line_upper=line_upper,
-        reference_row=constants.read("reference_row", np.float64, len(cells), entries),
+        reference_row=constants.read("reference_row", np.float64, rows, width),
     )
 
 
-def _read_runs(constants: _Constants, window: Window, shape: tuple[int, int]) -> RunTable:
-    """The look-ups of all masks, block by block, and the place of every mask. `shape`: (cells, entries)."""
-    folded = "frame_middle" in constants
-    columns = constants.read("frame_middle", np.int64, 1).item() if folded else window.right - window.left
-    demand(not folded or 2 * columns == window.right - window.left, "graph: the frame is not folded along the window's middle")
+def _read_runs(constants: _Constants, window: Window, cells: int, shape: tuple[int, int]) -> RunTable:
+    """The look-ups of all masks, block by block, and the place of every mask. `shape`: (rows, width)."""
+    folded, across = "fold" in constants, window.right - window.left
+    columns = constants.read("fold", BIT, across, -1).shape[1] if folded else across
+    demand(not folded or 2 * columns == across, "graph: the frame is not folded along the window's middle")
     blocks = []
     while (name := f"runs_{len(blocks)}") in constants:
         sides, masks = constants.read(f"run_layout_{len(blocks)}", np.int64, 2).tolist()
@@ -95,7 +101,7 @@ def _read_runs(constants: _Constants, window: Window, shape: tuple[int, int]) ->
     masks = blocks[0].shape[2]
     demand(all(block.shape[2] <= masks for block in blocks), "graph: a later block of runs reaches more masks than the first")
     places = []
-    for name, count in (("spatial", shape[0]), ("must_light", math.prod(shape)), ("may_light", math.prod(shape))):
+    for name, count in (("spatial", cells), ("must_light", math.prod(shape)), ("may_light", math.prod(shape))):
         place = constants.read(f"{name}_place", np.int32, count)
         demand(bool(((place >= 0) & (place < masks)).all()), f"graph: {name}_place points at no mask")
         places.append(place)

@@ -1,7 +1,8 @@
 """Masks as look-ups: S, K and O of all cells, counted by sums of the frame down its columns.
 
 A mask is a few vertical runs (`build_model.pixel_mask`), and the lit pixels of a run are the sum down to its end less the sum down to
-its start. Sorting the masks by their number of runs leaves few look-ups without use. Where every mask is its own mirror image, as those
+its start. Equal masks, which neighbouring cells often have, are counted once. Sorting the masks by their number of runs leaves few look-ups
+without use. Where every mask is its own mirror image, as those
 of a runway straight ahead are, the frame is folded along that axis first, and half of the runs remain.
 """
 
@@ -37,7 +38,7 @@ class RunTable:
     spatial: NDArray[np.int32]
     """The place of S_i, (cells,)."""
     must_light: NDArray[np.int32]
-    """The place of K_ij, (cells, entries); that of another mask of the cell in the padding."""
+    """The place of K_ij, (rows, width) as in `FilterTables`; that of another mask of the cell in the padding."""
     may_light: NDArray[np.int32]
     """The place of O_ij, likewise."""
 
@@ -58,8 +59,8 @@ class SpatialRuns:
     """1 at a start, -1 at a stop."""
 
 
-def run_table(banks: Sequence[CellBank], window: Window, dilated: bool) -> RunTable:
-    """The masks of all cells as look-ups into the window's sums; `dilated`: those of K into sums of their own."""
+def run_table(banks: Sequence[CellBank], window: Window, dilated: bool, width: int) -> RunTable:
+    """The masks of all cells as look-ups into the window's sums; `dilated`: those of K into sums of their own. `width`: of a row."""
     entries = [len(bank) for bank in banks]
     sizes = np.array([[1] * len(banks), entries, entries])
     first = (np.cumsum(sizes) - sizes.ravel()).reshape(sizes.shape)
@@ -73,12 +74,15 @@ def run_table(banks: Sequence[CellBank], window: Window, dilated: bool) -> RunTa
     in_must_light = (runs.mask >= first[1, 0]) & (runs.mask < first[2, 0])
     base = runs.column - window.left + np.where(in_must_light & dilated, (rows + 1) * columns, 0)
     ends = np.stack([(row - window.top) * columns + base for row in (runs.stop, runs.start)])
-    place, blocks = _blocks(runs.mask, ends, int(sizes.sum()))
-    places = [
-        np.stack([np.resize(place[start : start + size], group.max()) for start, size in zip(starts, group, strict=True)])
-        for starts, group in zip(first, sizes, strict=True)
-    ]
-    return RunTable(blocks, columns, folded, places[0].ravel(), places[1], places[2])
+    distinct, mask, ends = _distinct(runs.mask, ends, int(sizes.sum()))
+    place, blocks = _blocks(mask, ends, int(distinct.max()) + 1)
+
+    def rows_of(starts: NDArray[np.int64]) -> NDArray[np.int32]:
+        cells = zip(starts, entries, strict=True)
+        filled = [np.resize(place[distinct[start : start + size]], -(-size // width) * width) for start, size in cells]
+        return np.concatenate(filled).reshape(-1, width)
+
+    return RunTable(blocks, columns, folded, place[distinct[first[0]]], rows_of(first[1]), rows_of(first[2]))
 
 
 def spatial_runs(banks: Sequence[CellBank], window: Window) -> SpatialRuns:
@@ -103,6 +107,17 @@ def _joined(parts: Sequence[Runs], first: NDArray[np.int64]) -> Runs:
     """All masks in one list; `first` is the number of each part's first mask."""
     mask = np.concatenate([part.mask + number for part, number in zip(parts, first, strict=True)])
     return Runs(mask, *(np.concatenate([getattr(part, name) for part in parts]) for name in ("column", "start", "stop")))
+
+
+def _distinct(
+    mask: NDArray[np.int64], ends: NDArray[np.int64], masks: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """The number of every mask among those that differ, in order of appearance, and the runs of these alone, as in `_blocks`."""
+    numbers: dict[bytes, int] = {}
+    cuts = np.searchsorted(mask, np.arange(masks + 1)).tolist()
+    distinct = np.array([numbers.setdefault(ends[:, low:high].tobytes(), len(numbers)) for low, high in itertools.pairwise(cuts)])
+    kept = np.isin(mask, np.unique(distinct, return_index=True)[1])
+    return distinct, distinct[mask[kept]], ends[:, kept]
 
 
 def _blocks(mask: NDArray[np.int64], ends: NDArray[np.int64], masks: int) -> tuple[NDArray[np.int32], tuple[NDArray[np.int32], ...]]:

@@ -139,7 +139,7 @@ class StateNetwork(nn.Module):
         positions, channels = blocks - 1, CHANNELS[0]
         while positions > POSITIONS:
             following = CHANNELS[min(len(self.convolutions) + 1, len(CHANNELS) - 1)]
-            self.convolutions.append(nn.Conv1d(channels, following, kernel_size=3, stride=2))
+            self.convolutions.append(nn.Conv2d(channels, following, kernel_size=(1, 3), stride=(1, 2)))  # see `normalised`
             positions, channels = (positions - 3) // 2 + 1, following
         self.hidden = nn.Linear(positions * channels, HIDDEN)
         self.last = nn.Linear(HIDDEN, len(STATE_NAMES))
@@ -154,8 +154,11 @@ class StateNetwork(nn.Module):
         return self.middle + self.half_width * self.normalised(image)
 
     def normalised(self, image: Tensor) -> Tensor:
-        """The state in half-widths from the domain's middle, (n, 4). `image`: float32 (n, rows, columns), the window's pixels."""
-        signal = functional.relu(self.first(functional.pad(image, (0, 0, 0, self.padding)) if self.padding else image))
+        """The state in half-widths from the domain's middle, (n, 4). `image`: float32 (n, rows, columns), the window's pixels.
+
+        The signal is a picture of one row: onnxruntime convolves those twice as fast as a bare sequence.
+        """
+        signal = functional.relu(self.first(functional.pad(image, (0, 0, 0, self.padding)) if self.padding else image)).unsqueeze(2)
         for convolution in self.convolutions:
             signal = functional.relu(convolution(signal))
         return self.last(functional.relu(self.hidden(signal.flatten(1))))

@@ -182,14 +182,17 @@ def _check_whole_cells(model: onnx.ModelProto, cells: Partition, tables: FilterT
     close = (cells.lower - lower <= slack) & (upper - cells.upper <= slack)
     for text, holds in (("does not hold the cell", within), ("is wider than rounding asks", close)):
         demand(bool(holds.all()), f"the box of a whole cell {text}", int(np.argmin(holds.all(axis=1))))
-    used = (tables.must_light_size != PADDING_SIZE)[:, :, None]
-    inside = ((tables.state_lower >= lower[:, None]) & (tables.state_upper <= upper[:, None])) | ~used
-    demand(bool(inside.all()), "an entry's box of states reaches out of its cell", *_first(~inside.all(axis=2)))
+    used, cell = (tables.must_light_size != PADDING_SIZE)[:, :, None], tables.row_cell
+    inside = ((tables.state_lower >= lower[cell][:, None]) & (tables.state_upper <= upper[cell][:, None])) | ~used
+    row, place = np.argwhere(~inside.all(axis=2))[0] if not inside.all() else (0, 0)
+    demand(bool(inside.all()), "an entry's box of states reaches out of its cell", *_entry(tables, int(row), int(place)))
 
 
-def _first(faults: NDArray[np.bool_]) -> tuple[int, int]:
-    cell, entry = np.argwhere(faults)[0] if faults.any() else (0, 0)
-    return int(cell), int(entry)
+def _entry(tables: FilterTables, row: int, place: int) -> tuple[int, int]:
+    """Cell and number of the entry at a place of a row."""
+    cell = tables.row_cell[row]
+    before = row - int(np.searchsorted(tables.row_cell, cell))
+    return int(cell), before * tables.must_light_size.shape[1] + place
 
 
 def displacement_px(scene: Scene, window: Window) -> float:
@@ -247,11 +250,12 @@ def cell_claims(scene: Scene, tables: FilterTables) -> Iterator[CellClaim]:
     witnesses = (rows + 1) * runs.columns if scene.tolerance.line_px else 0
 
     def counted(places: NDArray[np.int32], base: int = 0) -> MaskRuns:
+        places = places.ravel()
         used = start[:, places] != stop[:, places]
         return MaskRuns(*(np.where(used, side[:, places] - base, 0) for side in (start, stop)), folded=runs.folded)
 
     for cell in range(len(tables.cells)):
-        painted = tables.spatial_runs.cell == cell
+        painted, rows = tables.spatial_runs.cell == cell, tables.row_cell == cell
         yield CellClaim(
             scene=scene,
             cell=cell,
@@ -260,14 +264,14 @@ def cell_claims(scene: Scene, tables: FilterTables) -> Iterator[CellClaim]:
             window=tables.window,
             spatial=counted(runs.spatial[cell : cell + 1]),
             painted=PaintedRuns(tables.spatial_runs.index[painted], tables.spatial_runs.step[painted]),
-            must_light=counted(runs.must_light[cell], witnesses),
-            may_light=counted(runs.may_light[cell]),
-            must_light_size=tables.must_light_size[cell],
-            line_lower=tables.line_lower[cell],
-            line_upper=tables.line_upper[cell],
-            reference_row=tables.reference_row[cell],
-            state_lower=tables.state_lower[cell],
-            state_upper=tables.state_upper[cell],
+            must_light=counted(runs.must_light[rows], witnesses),
+            may_light=counted(runs.may_light[rows]),
+            must_light_size=tables.must_light_size[rows].ravel(),
+            line_lower=tables.line_lower[rows].reshape(-1, 4),
+            line_upper=tables.line_upper[rows].reshape(-1, 4),
+            reference_row=tables.reference_row[rows].ravel(),
+            state_lower=tables.state_lower[rows].reshape(-1, 4),
+            state_upper=tables.state_upper[rows].reshape(-1, 4),
         )
 
 
@@ -284,11 +288,11 @@ def check_outputs(content: bytes, scene: Scene, tables: FilterTables) -> None:
     options.log_severity_level = 3  # it warns of the budgets, initialisers that are inputs too
     session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
     rng = np.random.default_rng(0)
-    claims = list(cell_claims(scene, tables))
+    claims, width = list(cell_claims(scene, tables)), tables.must_light_size.shape[1]
     for number in range(SAMPLE_FRAMES):
         frame = (rng.random(scene.camera.shape) < SAMPLE_DENSITIES[number % len(SAMPLE_DENSITIES)]).astype(np.uint8)
         missed, extra = (int(budget) for budget in rng.integers([0, -1], [tables.smallest_must_light, 64]))
-        expected = defined_outputs(claims, frame, missed, extra)
+        expected = defined_outputs(claims, width, frame, missed, extra)
         budgets = {"missed_budget": np.array(missed, dtype=np.int32), "extra_budget": np.array(extra, dtype=np.int32)}
         found = session.run(list(expected), {"frame": frame, **budgets})
         for name, value in zip(expected, map(np.asarray, found), strict=True):
@@ -297,24 +301,32 @@ def check_outputs(content: bytes, scene: Scene, tables: FilterTables) -> None:
             demand(same, f"graph: on sample frame {number} the output {name!r} is not what the masks define")
 
 
-def defined_outputs(claims: list[CellClaim], frame: NDArray[np.uint8], missed_budget: int, extra_budget: int) -> dict[str, NDArray]:
-    """NN_F's outputs by their definition; the hull of a cell without a passing entry is NaN."""
+def defined_outputs(
+    claims: list[CellClaim], row_width: int, frame: NDArray[np.uint8], missed_budget: int, extra_budget: int
+) -> dict[str, NDArray]:
+    """NN_F's outputs by their definition; the hull of a cell without a passing entry is NaN. `row_width`: entries in a row."""
     window, reach = claims[0].window, claims[0].scene.tolerance.line_px
     lit = frame.astype(bool)
     wide, span, (height, width) = np.pad(lit, reach), range(2 * reach + 1), lit.shape
     witnessed = np.logical_or.reduce([wide[row : row + height, column : column + width] for row in span for column in span])
     scores = [_scores(claim, lit[window.slices], witnessed[window.slices]) for claim in claims]
-    missed, extra = (np.array(part) for part in zip(*scores, strict=True))
-    passes = (missed <= missed_budget) & ((extra <= extra_budget) | (extra_budget < 0))
-    support, mismatch = passes.sum(axis=1, dtype=np.int32), (missed + extra).min(axis=1).astype(np.int32)
-    cell = support.argmax() if passes.any() else mismatch.argmin()
-    shown = support > 0 if passes.any() else np.arange(len(claims)) == cell
+    passes = [(missed <= missed_budget) & ((extra <= extra_budget) | (extra_budget < 0)) for missed, extra in scores]
+    support = np.array([part.sum() for part in passes], dtype=np.int32)
+    mismatch = np.array([(missed + extra).min() for missed, extra in scores], dtype=np.int32)
+    cell = support.argmax() if support.any() else mismatch.argmin()
+    shown = support > 0 if support.any() else np.arange(len(claims)) == cell
     filtered = np.zeros_like(frame)
     spatial = [claim.spatial.bits(window, claim.cell, "S")[0] for claim in claims]
     filtered[window.slices] = frame[window.slices] * np.any(np.array(spatial)[shown], axis=0)
     lower = np.array([_hull(claim.state_lower[chosen], np.min) for claim, chosen in zip(claims, passes, strict=True)])
     upper = np.array([_hull(claim.state_upper[chosen], np.max) for claim, chosen in zip(claims, passes, strict=True)])
-    outputs = {"passes": passes, "support": support, "mismatch": mismatch, "cell": np.array(cell), "filtered": filtered}
+    outputs = {
+        "passes": np.concatenate(passes).reshape(-1, row_width),
+        "support": support,
+        "mismatch": mismatch,
+        "cell": np.array(cell),
+        "filtered": filtered,
+    }
     return outputs | {"cell_lower": lower, "cell_upper": upper}
 
 

@@ -21,7 +21,7 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from runtime.estimator import Estimator
+from runtime.estimator import Estimate, Estimator
 from runtime.frames import FrameStream
 from runtime.image import runway_image
 from runtime.model_file import ModelError
@@ -32,6 +32,9 @@ Method = Callable[[NDArray[np.uint8]], object]
 
 CLUTTER = (0.0, 0.01, 0.02, 0.05)
 WINDOW_US = 40_000
+WARM_UP, WORKERS = 100, 2
+"""Of the throughput: frames that are not counted, and cores of `estimate_many`."""
+THROUGHPUT_CLUTTER = 0.02
 REFERENCE = "HoughLinesP"
 """The detector that ratios refer to."""
 USER_ERROR = 2
@@ -129,6 +132,23 @@ def benchmark(
         yield latencies(kind, measure(timed, cluttered_frames(estimator.scene, density, count, seed + number), rounds, clock))
     if recording is not None:
         yield latencies("recording", measure(timed, recorded_frames(recording, estimator.scene.camera.shape, count), rounds, clock))
+
+
+def rate(estimates: Iterator[Estimate], count: int, clock: Callable[[], float] = time.perf_counter) -> float:
+    """Estimates a second of an endless stream that runs already: workers have started, and as many frames are under way before as after."""
+    for _ in itertools.islice(estimates, WARM_UP):
+        pass
+    start = clock()
+    for _ in itertools.islice(estimates, count):
+        pass
+    return count / (clock() - start)
+
+
+def throughput(estimator: Estimator, frames: Frames, count: int, refine: bool) -> tuple[float, float]:
+    """Frames a second by single calls of `estimate`, and by `estimate_many` on `WORKERS` cores."""
+    alone = rate((estimator.estimate(frame, refine=refine) for frame in itertools.cycle(frames)), count)
+    together = estimator.estimate_many(itertools.cycle(frames), refine=refine, processes=WORKERS)
+    return alone, rate(together, count)
 
 
 def machine() -> dict[str, str]:
@@ -230,6 +250,9 @@ def bench_model_command() -> None:
             for kind in benchmark(estimator, frames, rounds, recording, seed, clock):
                 console.print(_table(Table, kind))
                 rows += kind
+            for refine in (False, True):
+                seen = cluttered_frames(estimator.scene, THROUGHPUT_CLUTTER, frames, seed)
+                console.print(_rates(refine, *throughput(estimator, seen, frames * rounds, refine)), highlight=False)
             output.mkdir(parents=True, exist_ok=True)
             (output / "bench.csv").write_text(as_csv(header, rows), encoding="utf-8")
             cv2.imwrite(str(output / "bench.png"), chart(header, rows))
@@ -238,6 +261,11 @@ def bench_model_command() -> None:
             raise typer.Exit(USER_ERROR) from None
 
     typer.run(bench_model)
+
+
+def _rates(refine: bool, alone: float, together: float) -> str:
+    kind = "with refinement" if refine else "without refinement"
+    return f"estimate_many {kind}, {WORKERS} workers: {together:,.0f} frames/s, {together / alone:.2f} x the {alone:,.0f} of single calls"
 
 
 def _table(make: Callable[..., Any], rows: Sequence[Latency]) -> Any:

@@ -31,7 +31,9 @@ LOG_ERRORS_ONLY = 3
 REFINED_BEYOND_PX = 2
 """How far beyond the spatial masks the refinement looks at pixels; those farther out it takes for lit."""
 OUTPUTS = ("cell", "support", "mismatch", "passes", "cell_lower", "cell_upper", "filtered", "network_state")
-BOX_TENSORS = ("state_lower", "state_upper", "line_lower", "line_upper", "reference_row")
+SIDES = ("lower", "upper")
+STATE_BOX_TENSORS = tuple(f"{name}_{side}" for name in STATE_NAMES for side in SIDES)
+BOX_TENSORS = ("row_cell", *STATE_BOX_TENSORS, "line_lower", "line_upper", "reference_row")
 MASK_TENSORS = ("spatial_run_cell", "spatial_run_index", "spatial_run_step", "window_first", "window_stop")
 """Initialisers that hold every entry as a box of states and of line coordinates, and every cell's spatial mask."""
 
@@ -226,8 +228,9 @@ class Estimator:
         witnesses = self._witnesses(frame)
         if self._refiner.extra_budget < 0 or self.scene.tolerance.line_px > 0:
             return self._refiner.refine(witnesses, self._entries.sets(passes))
-        cells = np.flatnonzero(passes.any(axis=1))
-        alone = np.arange(len(passes))[:, None]
+        row_cell = self._entries.row_cell
+        cells = np.unique(row_cell[passes.any(axis=1)])
+        alone = row_cell[:, None]
         return joined(
             *(
                 self._refiner.refine(witnesses, self._entries.sets(passes & (alone == cell)), self._entries.within(int(cell), frame))
@@ -318,6 +321,8 @@ class _Entries:
     """Every bank entry of the model as a set of states, padding included, which never passes; and the cells' spatial masks."""
 
     all: StateSet
+    row_cell: NDArray[np.int32]
+    """The cell of each row of entries, (rows,)."""
     run_cell: NDArray[np.int32]
     run_index: NDArray[np.int32]
     run_step: NDArray[np.int32]
@@ -327,7 +332,8 @@ class _Entries:
     @staticmethod
     def of(scene: Scene, tensors: dict[str, NDArray[Any]]) -> _Entries:
         """The entries from the model's initialisers; an axis of width 0 is exact."""
-        states = np.stack([tensors["state_lower"], tensors["state_upper"]], axis=-1).astype(np.float64).reshape(4, -1, 2)
+        boxes = (np.stack([tensors[f"{name}_{side}"].ravel() for side in SIDES], axis=-1) for name in STATE_NAMES)
+        states = np.stack(list(boxes)).astype(np.float64)
         scale = np.stack([tensors["line_lower"][..., 2], tensors["line_upper"][..., 2]], axis=-1).reshape(-1, 2)
         for axis, (low, high) in enumerate(zip(scene.domain.lower, scene.domain.upper, strict=True)):
             states[axis] = np.clip(states[axis], low, high)
@@ -335,10 +341,10 @@ class _Entries:
         sets = StateSet(theta, x, y, z, scale, tangent_of_row(scene.camera, tensors["reference_row"].ravel()))
         window = tuple(slice(int(first), int(stop)) for first, stop in zip(tensors["window_first"], tensors["window_stop"], strict=True))
         cell, index, step = (tensors[f"spatial_run_{part}"].copy() for part in ("cell", "index", "step"))  # not to keep the file
-        return _Entries(sets, cell, index, step, (window[0], window[1]))
+        return _Entries(sets, tensors["row_cell"].copy(), cell, index, step, (window[0], window[1]))
 
     def sets(self, passes: NDArray[np.bool_]) -> StateSet:
-        """The entries that pass; `passes` is (cells, entries)."""
+        """The entries that pass; `passes` is (rows, width), a cell's entries in one row or several."""
         return self.all[np.flatnonzero(passes)]
 
     def window_and_beyond(self, margin_px: int) -> tuple[slice, slice]:

@@ -67,15 +67,19 @@ def counted(table: RunTable, sums: list[int], place: int) -> int:
 def check(drawn: list[tuple[Bits, Bits, Bits]], seed: int, dilated: bool, folded: bool) -> None:
     rng = np.random.default_rng(seed)
     frame, witnesses = rng.integers(0, 2, (2, ROWS, COLUMNS), dtype=np.uint8)
-    table = run_table([bank_of(*cell) for cell in drawn], WINDOW, dilated)
+    width = int(rng.integers(1, 5))
+    table = run_table([bank_of(*cell) for cell in drawn], WINDOW, dilated, width)
     assert table.folded == folded
     sums = flat_sums(frame, folded) + (flat_sums(witnesses, folded) if dilated else [])
+    row = 0
     for cell, (spatial, must, may) in enumerate(drawn):
         assert counted(table, sums, table.spatial[cell]) == int((spatial & (frame == 1)).sum())
         for entry in range(len(must)):
-            judged = witnesses if dilated else frame
-            assert counted(table, sums, table.must_light[cell, entry]) == int((must[entry] & (judged == 1)).sum())
-            assert counted(table, sums, table.may_light[cell, entry]) == int((may[entry] & (frame == 1)).sum())
+            judged, place = witnesses if dilated else frame, (row + entry // width, entry % width)
+            assert counted(table, sums, table.must_light[place]) == int((must[entry] & (judged == 1)).sum())
+            assert counted(table, sums, table.may_light[place]) == int((may[entry] & (frame == 1)).sum())
+        row += -(-len(must) // width)
+    assert table.must_light.shape == table.may_light.shape == (row, width)
 
 
 @given(drawn=cells(), seed=st.integers(0, 1000), dilated=st.booleans())
@@ -127,10 +131,17 @@ def test_blocks_are_the_cheapest_of_all_divisions(falls: list[int], masks: int) 
 
 @pytest.mark.parametrize("dilated", [False, True])
 def test_only_wanted_sums_are_looked_up(dilated: bool) -> None:
-    """Tightness: one mask with three runs beside many with one costs little more than the runs themselves."""
-    solid, striped = np.ones((1, ROWS, COLUMNS), dtype=bool), np.zeros((1, ROWS, COLUMNS), dtype=bool)
-    solid[:, :, 1:] = False
-    striped[:, ::3, 0] = True
-    bank = bank_of(solid[0], np.repeat(solid, 4000, axis=0), np.concatenate([striped, np.repeat(solid, 3999, axis=0)]))
-    table = run_table([bank], WINDOW, dilated)
-    assert table.look_ups == 2 * (8001 + 2)
+    """Tightness: one mask with three runs beside many with one costs little more than the runs themselves, and equal masks cost nothing."""
+    tall = Window(0, 130, 20, 21)
+    solid = np.zeros((4000, 130, 1), dtype=bool)
+    for mask, (start, stop) in zip(solid, itertools.combinations(range(130), 2), strict=False):
+        mask[start:stop] = True
+    striped = np.zeros((1, 130, 1), dtype=bool)
+    striped[:, [0, 2, 4]] = True
+    may = runs_of(np.concatenate([striped, solid[1:]]), tall)
+    blank = np.zeros((4000, 4))
+    lines, states = LineBoxes(blank, blank, blank[:, 0]), blank.astype(np.float32)
+    bank = CellBank(lines, runs_of(solid[:1], tall), runs_of(solid, tall), may, tall, states, states)
+    look_ups = run_table([bank], tall, dilated, 4000).look_ups
+    assert look_ups == 2 * ((2 if dilated else 1) * 4000 + 1 + 2)
+    assert run_table([bank, bank], tall, dilated, 4000).look_ups == look_ups

@@ -51,7 +51,9 @@ FREE = replace(
     runway=Runway((*SCENE.runway.markings, Marking("C", 0.0, 0.2, 0.5))),
     domain=replace(SCENE.domain, x_m=Axis((0.0,), 0.01), y_m=Axis((0.8,), 0.04)),
 )
-SCENES = {"paper's shape": SCENE, "tolerant": TOLERANT, "free x, three markings": FREE}
+SCENES = {"paper's shape": SCENE, "tolerant": TOLERANT, "free x, three markings": FREE, "several rows a cell": SCENE}
+WIDTH = 5
+"""Of the rows in the last scene's model."""
 Rng = np.random.Generator
 
 
@@ -126,15 +128,29 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     paths = {}
     for number, (name, scene) in enumerate(SCENES.items()):
         paths[name] = folder / f"{number}.onnx"
-        export_model(scene, paths[name], estimator=small_network(scene, folder / f"network{number}.onnx"))
+        with pytest.MonkeyPatch.context() as patch:
+            if name == "several rows a cell":
+                patch.setattr("build_model.filter_network.row_width", lambda _entries: WIDTH)
+            export_model(scene, paths[name], estimator=small_network(scene, folder / f"network{number}.onnx"))
     return paths
+
+
+def taken_apart(path: Path) -> Model:
+    proto = onnx.load(path)
+    return Model(SCENE, build_banks(SCENE), proto, json.loads(proto.metadata_props[0].value))
 
 
 @pytest.fixture
 def model(files: dict[str, Path]) -> Model:
     """The first scene's model, to be mutated."""
-    proto = onnx.load(files["paper's shape"])
-    return Model(SCENE, build_banks(SCENE), proto, json.loads(proto.metadata_props[0].value))
+    return taken_apart(files["paper's shape"])
+
+
+@pytest.fixture
+def model_in_rows(files: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> Model:
+    """The same with several rows a cell, which it keeps when it is written anew."""
+    monkeypatch.setattr("build_model.filter_network.row_width", lambda _entries: WIDTH)
+    return taken_apart(files["several rows a cell"])
 
 
 def bits_of(bank: CellBank) -> tuple[Bits, Bits, Bits]:
@@ -343,7 +359,7 @@ def change_small_constant(rng: Rng, model: Model, _cell: int) -> None:
     names = [
         name
         for name in filter_constants(model)
-        if not re.match("runs_|line_|state_|spatial_run|reference_row|.*_(budget|place|size)$", name)
+        if not re.match("runs_|spatial_run|reference_row|largest_|farthest|[a-z]+_(lower|upper|budget|place|size)$", name)
     ]
     name = str(rng.choice(names))
     values = numpy_helper.to_array(model.constants[name]).copy()
@@ -366,7 +382,7 @@ def filter_node(model: Model, name: str) -> onnx.NodeProto:
 
 
 def change_threshold(rng: Rng, model: Model, _cell: int) -> None:
-    filter_node(model, str(rng.choice(["within_missed", "few_extra"]))).op_type = "Less"
+    filter_node(model, str(rng.choice(["within_missed", "within_extra"]))).op_type = "Less"
 
 
 def change_operator(rng: Rng, model: Model, _cell: int) -> None:
@@ -455,6 +471,34 @@ def test_what_was_built_is_proved(files: dict[str, Path], name: str) -> None:
 @pytest.mark.parametrize(("mutate", "claims"), MATHEMATICAL.items(), ids=lambda value: getattr(value, "__name__", ""))
 def test_a_wrong_build_is_refuted(model: Model, tmp_path: Path, mutate: Callable[[Rng, Model, int], None], claims: str, seed: int) -> None:
     assert_refuted(model, tmp_path, mutate, claims, seed)
+
+
+def give_a_row_to_the_cell_before(_rng: Rng, model: Model, _cell: int) -> None:
+    tables = model.tables()
+    row_cell = tables.row_cell.copy()
+    row_cell[np.searchsorted(row_cell, 1)] = 0
+    model.set_tables(replace(tables, row_cell=row_cell))
+
+
+def change_row_cell(_rng: Rng, model: Model, _cell: int) -> None:
+    row_cell = model.tables().row_cell.copy()
+    row_cell[-1] = 0
+    model.set_constant("row_cell", row_cell)
+
+
+IN_ROWS = {mutate: MATHEMATICAL[mutate] for mutate in (add_pixel_to_must_light, drop_pixel_from_may_light, narrow_state_box, remove_entry)}
+
+
+@pytest.mark.parametrize(
+    ("mutate", "claims"),
+    {**IN_ROWS, give_a_row_to_the_cell_before: "reaches out of its cell", change_row_cell: "row_cell"}.items(),
+    ids=lambda value: getattr(value, "__name__", ""),
+)
+def test_a_wrong_model_of_several_rows_a_cell_is_refuted(
+    model_in_rows: Model, tmp_path: Path, mutate: Callable[[Rng, Model, int], None], claims: str
+) -> None:
+    assert len(model_in_rows.tables().row_cell) > len(model_in_rows.banks)
+    assert_refuted(model_in_rows, tmp_path, mutate, claims, seed=0)
 
 
 @pytest.mark.parametrize("seed", range(2))

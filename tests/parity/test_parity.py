@@ -17,7 +17,8 @@ from onnx.reference.op_run import OpRun
 from scenes import SCENES, Frame, random_clutter
 
 from build_model.export import build_banks
-from build_model.filter_network import NEVER, FilterNetwork
+from build_model.filter_graph import IR_VERSION, OPSET, filter_graph
+from build_model.filter_network import NEVER, FilterNetwork, assemble
 from build_model.hough_bank import CellBank
 from runtime.image import runway_image
 from runtime.scene import Scene
@@ -46,8 +47,8 @@ STANDARD = {
     "Less",
     "LessOrEqual",
     "MatMul",
+    "MatMulInteger",
     "MaxPool",
-    "Min",
     "Mul",
     "Neg",
     "Not",
@@ -70,7 +71,7 @@ STANDARD = {
 """Operators of the default domain that a model may use; none of them has a graph in it."""
 
 
-def session(path: Path, level: onnxruntime.GraphOptimizationLevel | None = None, threads: int = 1) -> onnxruntime.InferenceSession:
+def session(path: Path | bytes, level: onnxruntime.GraphOptimizationLevel | None = None, threads: int = 1) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = 3
@@ -129,6 +130,24 @@ def test_onnxruntime_gives_the_torch_networks_outputs(model_of: ModelOf, name: s
             reference = expected[output].numpy()
             assert found[output].shape == reference.shape
             assert (found[output] == reference).all(), (output, budgets)
+
+
+@pytest.mark.parametrize(("name", "width"), [("paper", 64), ("paper", 7), ("tolerant, free x", 3), ("one cell", 1)])
+def test_rows_of_any_width_give_the_same(monkeypatch: pytest.MonkeyPatch, name: str, width: int) -> None:
+    """A cell's entries in several rows: all outputs as the torch network gives them; `passes` cut into rows, padding never among it."""
+    monkeypatch.setattr("build_model.filter_network.row_width", lambda _entries: width)
+    scene = SCENES[name]
+    banks = build_banks(scene)
+    network, tables = FilterNetwork(scene, banks), assemble(scene, banks)
+    opsets = [onnx.helper.make_opsetid("", OPSET)]
+    model = session(onnx.helper.make_model(filter_graph(scene, tables), opset_imports=opsets, ir_version=IR_VERSION).SerializeToString())
+    assert tables.must_light_size.shape == (sum(-(-len(bank) // width) for bank in banks), width)
+    for frame, budgets in zip(frames_of(scene), itertools.cycle([(0, -1), (2, 0), (1, 30)]), strict=False):
+        expected, found = network(torch.from_numpy(frame), *budgets), evaluate(model, frame, budgets)
+        for output in REFERENCE:
+            assert np.array_equal(found[output], expected[output].numpy()), (output, budgets)
+        assert not (found["passes"] & (tables.must_light_size == NEVER)).any()
+        assert np.array_equal(np.bincount(tables.row_cell, weights=found["passes"].sum(axis=1)), found["support"])
 
 
 def test_the_torch_network_is_what_the_definition_says(model_of: ModelOf) -> None:
@@ -249,12 +268,12 @@ def test_inputs_and_outputs_are_those_of_the_table(model_of: ModelOf, name: str)
         default = onnx.numpy_helper.to_array(given[budget])
         assert (default.dtype, default.shape, int(default)) == (np.int32, (), getattr(scene.tolerance, budget))
     model = session(model_of(name))
-    cells, entries = scene.domain.cell_count, given["must_light_size"].dims[1]
+    cells, (rows, width) = scene.domain.cell_count, given["must_light_size"].dims
     assert {output.name: (output.type, output.shape) for output in model.get_outputs()} == {
         "cell": ("tensor(int64)", []),
         "support": ("tensor(int32)", [cells]),
         "mismatch": ("tensor(int32)", [cells]),
-        "passes": ("tensor(bool)", [cells, entries]),
+        "passes": ("tensor(bool)", [rows, width]),
         "cell_lower": ("tensor(float)", [cells, 4]),
         "cell_upper": ("tensor(float)", [cells, 4]),
         "filtered": ("tensor(uint8)", list(scene.camera.shape)),
