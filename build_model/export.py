@@ -210,8 +210,7 @@ def user_network(scene: Scene, path: Path) -> onnx.GraphProto:
     except Exception as error:  # onnx's parser, checker and converter raise classes that share only this one
         reason = " ".join(str(error).split())
         raise EstimatorError(f"{path}: not a usable ONNX model ({reason:.160})") from error
-    given = {tensor.name for tensor in graph.initializer}
-    inputs = [value for value in graph.input if value.name not in given]
+    inputs = list(graph.input)
     expected = f"one input float32 [1, 1, {scene.camera.height}, {scene.camera.width}] and one output float32 [1, 4]"
     found = f"inputs {[_described(value) for value in inputs]} and outputs {[_described(value) for value in graph.output]}"
     wanted = [f"FLOAT {[1, 1, *scene.camera.shape]}"], [f"FLOAT {[1, 4]}"]
@@ -219,16 +218,16 @@ def user_network(scene: Scene, path: Path) -> onnx.GraphProto:
         raise EstimatorError(f"{path}: found {found}; expected {expected}")
     if any(domain.domain not in ("", "ai.onnx") for domain in model.opset_import) or model.functions:
         raise EstimatorError(f"{path}: found operators or functions of its own; expected standard operators only")
+    _check_static(path, shapes.graph)
     try:
         check_graph(_bare(graph).SerializeToString())
     except ModelError as error:
         raise EstimatorError(f"{path}: {error}") from error
-    _check_static(path, shapes.graph)
     return graph
 
 
 def _with_plain_constants(graph: onnx.GraphProto) -> onnx.GraphProto:
-    """The graph with every Constant among the initialisers, and these as raw bytes."""
+    """The graph with every Constant among the initialisers, these as raw bytes, and none of them an input too."""
     plain = onnx.GraphProto()
     plain.CopyFrom(graph)
     constants = [node for node in plain.node if node.op_type == "Constant" and node.attribute[0].name in CONSTANT_VALUES]
@@ -240,6 +239,9 @@ def _with_plain_constants(graph: onnx.GraphProto) -> onnx.GraphProto:
         plain.node.remove(node)
     for tensor in plain.initializer:
         tensor.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensor), tensor.name))
+    given = {tensor.name for tensor in plain.initializer}
+    for value in [value for value in plain.input if value.name in given]:
+        plain.input.remove(value)
     return plain
 
 

@@ -168,8 +168,14 @@ class Estimator:
         return self.run_unchecked(self._checked_frame(frame))
 
     def run_unchecked(self, pixels: NDArray[np.uint8]) -> dict[str, Any]:
-        """`run` for a frame that is known to be uint8 (height, width) of {0, 1}: one call of onnxruntime."""
-        return dict(zip(OUTPUTS, self._session.run(OUTPUTS, {"frame": pixels, **self._budgets}), strict=True))
+        """`run` for a frame that is known to be uint8 (height, width) of {0, 1}: one call of onnxruntime.
+
+        Raises `ModelError` if that fails, which it may for a file that no `sha256` vouches for.
+        """
+        try:
+            return dict(zip(OUTPUTS, self._session.run(OUTPUTS, {"frame": pixels, **self._budgets}), strict=True))
+        except Exception as error:  # onnxruntime raises classes of its own that share only this one
+            raise ModelError(f"{self._arguments['path']}: onnxruntime cannot run it ({_reason(error)}); export it again") from error
 
     def estimate(self, frame: NDArray, proposal: ArrayLike | None = None, refine: bool = True) -> Estimate:
         """State and certified box of one frame.
@@ -312,8 +318,7 @@ class Estimator:
                 content, options, providers=["CPUExecutionProvider"], disabled_optimizers=["ConstantFolding"]
             )
         except Exception as error:  # onnxruntime raises classes of its own that share only this one
-            reason = " ".join(str(error).split())
-            raise ModelError(f"{name}: onnxruntime {onnxruntime.__version__} cannot load it ({reason:.200})") from error
+            raise ModelError(f"{name}: onnxruntime {onnxruntime.__version__} cannot load it ({_reason(error)})") from error
 
 
 @dataclass(frozen=True)
@@ -396,6 +401,11 @@ def _check_interface(session: onnxruntime.InferenceSession, scene: Scene, entrie
         found = sorted((value.name, value.type, value.shape) for value in values)
         if found != expected[kind]:
             raise ModelError(f"{name}: its {kind} are {found!s:.200}, its scene asks for {expected[kind]}; export it again")
+
+
+def _reason(error: Exception) -> str:
+    """An error of onnxruntime's on one line."""
+    return " ".join(str(error).split())[:200]
 
 
 def _read(path: Path) -> bytes:
