@@ -59,7 +59,7 @@ LAYOUT = (
     "Transpose Unsqueeze"
 )
 LAYERS = (
-    "AveragePool BatchNormalization Celu Conv Dropout Elu Gelu Gemm GlobalAveragePool GlobalMaxPool GroupNormalization HardSigmoid "
+    "AveragePool BatchNormalization Celu Conv Dropout Elu Gelu Gemm GlobalAveragePool GlobalMaxPool HardSigmoid "
     "HardSwish InstanceNormalization LRN LayerNormalization LeakyRelu LogSoftmax LpNormalization LpPool MatMul MaxPool Mish PRelu Relu "
     "Selu Sigmoid Softmax Softplus Softsign Tanh ThresholdedRelu "
     "ConvInteger DequantizeLinear DynamicQuantizeLinear MatMulInteger QLinearConv QLinearMatMul QuantizeLinear"
@@ -97,26 +97,26 @@ class Message:
 
 
 MODEL = Message(
-    "file",
+    "a file",
     {1: "ir_version", 2: "producer_name", 7: "graph"},
     {8: "opset_import", 14: "metadata_props"},
     {20: "training_info", 25: "functions"},
 )
 GRAPH = Message(
-    "graph",
+    "a graph",
     {2: "name"},
     {1: "node", 5: "initializer", 11: "input", 12: "output"},
     {13: "value_info", 14: "quantization_annotation", 15: "sparse_initializer"},
 )
-NODE = Message("node", {3: "name", 4: "op_type", 7: "domain", 8: "overload"}, {1: "input", 2: "output", 5: "attribute"}, {})
+NODE = Message("a node", {3: "name", 4: "op_type", 7: "domain", 8: "overload"}, {1: "input", 2: "output", 5: "attribute"}, {})
 ATTRIBUTE = Message(
-    "attribute",
+    "an attribute",
     {1: "name", 2: "f", 3: "i", 4: "s", 20: "type"},
     {7: "floats", 8: "ints", 9: "strings"},
     {5: "a tensor", 6: "a graph", 10: "tensors", 11: "graphs", 21: "ref_attr_name", 22: "a sparse tensor", 23: "sparse tensors"},
 )
 TENSOR = Message(
-    "constant",
+    "a constant",
     {2: "data_type", 8: "name", 9: "raw_data"},
     {1: "dims"},
     {4: "float_data", 5: "int32_data", 6: "string_data", 7: "int64_data", 10: "double_data", 11: "uint64_data", 13: "external_data"}
@@ -256,7 +256,7 @@ class _Reader:
         """`read` for a message that may hold nothing else."""
         fields, rest = self.read(message, kind)
         if rest:
-            raise ModelError(f"found {rest[0]} in a {kind.name}, which export-model does not write; export it again")
+            raise ModelError(f"found {rest[0]} in {kind.name}, which export-model does not write; export it again")
         return fields
 
     def read(self, message: memoryview, kind: Message) -> tuple[Fields, list[str]]:
@@ -272,7 +272,7 @@ class _Reader:
                 rest.append(kind.name_of(number))
                 continue
             if number in kind.once and found[names[number]]:
-                raise ModelError(f"found {names[number]} twice in the {kind.name}; export it again with export-model")
+                raise ModelError(f"found {names[number]} twice in {kind.name}; export it again with export-model")
             found[names[number]].append(value)
         return found, rest
 
