@@ -38,6 +38,7 @@ out/paper.onnx: models/paper.toml constraints.txt $(SOURCES) | $(INSTALLED)
 
 evidence: out/paper.onnx
 	$(BIN)/python scripts/coverage.py $< --frames 24000 -o out/coverage.json
+	$(BIN)/python scripts/fuzz.py $< --minutes 10 -o out/fuzz
 	$(BIN)/python -m pytest --hypothesis-profile=long
 
 clean:

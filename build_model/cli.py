@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 if TYPE_CHECKING:
+    from types import FrameType
+
     from build_model.export import ExportReport
     from runtime.scene import Scene
 
@@ -40,24 +45,54 @@ def export_model(
     ] = None,
 ) -> None:
     """Build NN_F from the scene, train NN_e (or take yours), and write one ONNX file with both."""
+    target = output or Path("out") / f"{scene.stem}.onnx"
+    console = Console()
+    with _interrupts_end_in_a_line(target):
+        loaded, report = _export(console, scene, target, estimator=estimator, seed=seed, jobs=jobs, dask=dask)
+    _print_summary(console, loaded, target, report)
+
+
+@contextmanager
+def _interrupts_end_in_a_line(target: Path) -> Iterator[None]:
+    """Ends the command with one line and exit code 130 on Ctrl-C.
+
+    What ends the block after the signal is taken for its consequence: an import of torch's that it breaks off ends in an error of another
+    class. A signal that is ignored, as in a background job of a shell, stays so.
+    """
+    seen = []
+
+    def note(signum: int, frame: FrameType | None) -> None:
+        seen.append(signum)
+        signal.default_int_handler(signum, frame)
+
+    earlier = signal.getsignal(signal.SIGINT)
+    if earlier is signal.default_int_handler:
+        signal.signal(signal.SIGINT, note)
+    try:
+        yield
+    except BaseException:
+        if not seen:
+            raise
+        fail(f"{target}: interrupted; the model that was there before is untouched", INTERRUPTED)
+    finally:
+        signal.signal(signal.SIGINT, earlier)
+
+
+def _export(console: Console, scene: Path, target: Path, **options: Any) -> tuple[Scene, ExportReport]:
+    """Reads the scene and builds the model, with a progress bar. torch is imported here, where an interrupt is provided for."""
     try:
         from build_model.export import ClusterError, EstimatorError, export_model
         from runtime.scene import Scene, SceneError
-    except ImportError as error:
+    except ModuleNotFoundError as error:
         fail(f"export-model: the package {error.name!r} is missing; pip install 'glideproof[build]'")
-    target = output or Path("out") / f"{scene.stem}.onnx"
-    console = Console()
     try:
         loaded = Scene.load(scene)
         with _progress(console) as bars:
-            report = export_model(loaded, target, estimator=estimator, seed=seed, jobs=jobs, dask=dask, progress=_Bars(bars).update)
+            return loaded, export_model(loaded, target, progress=_Bars(bars).update, **options)
     except (SceneError, EstimatorError, ClusterError) as error:
         fail(error)
     except OSError as error:
         fail(f"{target}: cannot be written ({error.strerror}); the model that was there before is untouched")
-    except KeyboardInterrupt:
-        fail(f"{target}: interrupted; the model that was there before is untouched", INTERRUPTED)
-    _print_summary(console, loaded, target, report)
 
 
 def _progress(console: Console) -> Progress:

@@ -24,10 +24,11 @@ import joblib
 import numpy as np
 import onnx
 import onnx.compose
+import onnx.shape_inference
 import onnx.version_converter
 import onnxruntime
 from numpy.typing import NDArray
-from onnx import TensorProto, helper
+from onnx import TensorProto, helper, numpy_helper
 
 from build_model.calibration import check_calibration
 from build_model.filter_graph import IR_VERSION, OPSET, GraphWriter, filter_graph
@@ -36,13 +37,15 @@ from build_model.hough_bank import CellBank, cell_bank
 from build_model.partition import partition
 from build_model.reachability import PaperBound, paper_bound
 from build_model.state_network import TrainingReport, state_graph, train_state_network
-from runtime.model_file import FORMAT_VERSION, METADATA_KEY, metadata_digest
+from runtime.model_file import FORMAT_VERSION, METADATA_KEY, ModelError, check_graph, metadata_digest
 from runtime.rounding import OUTWARD_PX
 from runtime.scene import Scene
 
 Progress = Callable[[str, int, int, float | None], None]
 """Called with a stage, steps done, steps in all, and the loss where there is one."""
 NETWORK_PREFIX = "state_network/"
+CONSTANT_VALUES = {"value": None, "value_float": np.float32, "value_floats": np.float32, "value_int": np.int64, "value_ints": np.int64}
+"""How a Constant may hold its value: as a tensor, or as numbers of the type given."""
 CONNECT_SECONDS = 10
 """How long the scheduler of a cluster may take to answer."""
 VERSIONS = ("glideproof", "numpy", "onnx", "onnxruntime", "torch")
@@ -198,19 +201,25 @@ def _state_network(
 
 
 def user_network(scene: Scene, path: Path) -> onnx.GraphProto:
-    """A user's NN_e. Raises `EstimatorError` unless it maps float32 [1, 1, height, width] to float32 [1, 4] with fixed shapes."""
+    """A user's NN_e, its constants as initialisers of raw bytes, as the runtime wants them.
+
+    Raises `EstimatorError` unless it maps float32 [1, 1, height, width] to float32 [1, 4], with fixed shapes throughout and nothing that
+    the runtime would refuse (`runtime.model_file`).
+    """
     try:
         model = onnx.load(path, load_external_data=False)
         onnx.checker.check_model(model)
         model = onnx.version_converter.convert_version(model, OPSET) if model.opset_import[0].version != OPSET else model
+        graph = _with_plain_constants(model.graph)
+        shapes = onnx.shape_inference.infer_shapes(
+            helper.make_model(graph, opset_imports=model.opset_import), strict_mode=True, data_prop=True
+        )
     except OSError as error:
         raise EstimatorError(f"{path}: cannot be read ({error.strerror}); give the path of an ONNX file") from error
     except Exception as error:  # onnx's parser, checker and converter raise classes that share only this one
         reason = " ".join(str(error).split())
         raise EstimatorError(f"{path}: not a usable ONNX model ({reason:.160})") from error
-    graph = model.graph
-    given = {tensor.name for tensor in graph.initializer}
-    inputs = [value for value in graph.input if value.name not in given]
+    inputs = list(graph.input)
     expected = f"one input float32 [1, 1, {scene.camera.height}, {scene.camera.width}] and one output float32 [1, 4]"
     found = f"inputs {[_described(value) for value in inputs]} and outputs {[_described(value) for value in graph.output]}"
     wanted = [f"FLOAT {[1, 1, *scene.camera.shape]}"], [f"FLOAT {[1, 4]}"]
@@ -218,10 +227,48 @@ def user_network(scene: Scene, path: Path) -> onnx.GraphProto:
         raise EstimatorError(f"{path}: found {found}; expected {expected}")
     if any(domain.domain not in ("", "ai.onnx") for domain in model.opset_import) or model.functions:
         raise EstimatorError(f"{path}: found operators or functions of its own; expected standard operators only")
-    branching = sorted({node.op_type for node in graph.node if any(part.HasField("g") or part.graphs for part in node.attribute)})
-    if branching:
-        raise EstimatorError(f"{path}: found control flow ({', '.join(branching)}); expected a graph that is the same for every frame")
+    _check_static(path, shapes.graph)
+    try:
+        check_graph(_bare(graph).SerializeToString())
+    except ModelError as error:
+        raise EstimatorError(f"{path}: {error}") from error
     return graph
+
+
+def _with_plain_constants(graph: onnx.GraphProto) -> onnx.GraphProto:
+    """The graph with every Constant among the initialisers, these as raw bytes, and none of them an input too."""
+    plain = onnx.GraphProto()
+    plain.CopyFrom(graph)
+    constants = [node for node in plain.node if node.op_type == "Constant" and node.attribute[0].name in CONSTANT_VALUES]
+    for node in constants:
+        value = helper.get_attribute_value(node.attribute[0])
+        dtype = CONSTANT_VALUES[node.attribute[0].name]
+        array = numpy_helper.to_array(value) if dtype is None else np.array(value, dtype=dtype)
+        plain.initializer.append(numpy_helper.from_array(array, node.output[0]))
+        plain.node.remove(node)
+    for tensor in plain.initializer:
+        tensor.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensor), tensor.name))
+    given = {tensor.name for tensor in plain.initializer}
+    for value in [value for value in plain.input if value.name in given]:
+        plain.input.remove(value)
+    return plain
+
+
+def _check_static(path: Path, inferred: onnx.GraphProto) -> None:
+    """Raises `EstimatorError` unless every tensor between the nodes has a fixed shape."""
+    values = {value.name: value for value in (*inferred.value_info, *inferred.output)}
+    for node in inferred.node:
+        for name in filter(None, node.output):
+            shown = _described(values[name]) if name in values else "of unknown shape"
+            dims = values[name].type.tensor_type.shape.dim if name in values else []
+            if (
+                name not in values
+                or not values[name].type.tensor_type.HasField("shape")
+                or not all(dim.HasField("dim_value") for dim in dims)
+            ):
+                raise EstimatorError(
+                    f"{path}: found {name!r} ({node.op_type}), {shown}; expected fixed shapes throughout: export it with them"
+                )
 
 
 def _described(value: onnx.ValueInfoProto) -> str:

@@ -20,6 +20,9 @@ Frame = NDArray[np.uint8]
 LARGEST_TIME_US = 2**61
 """Times and windows beyond this are refused, so that the end of a window is always an int64."""
 
+LARGEST_SIDE_PX = 16384
+"""Largest height and width of a frame, as in `runtime.scene`: a frame is memory, whatever a recording's header says."""
+
 LARGEST_RESULT_BYTES = 2**32
 """What `events_to_frames` may hold at once; `FrameStream` has no such limit, as it holds one frame at a time."""
 
@@ -50,7 +53,8 @@ class FrameStream:
 
     def __init__(self, shape: tuple[int, int], window_us: int, step_us: int | None = None) -> None:
         """Checks the sizes: raises `EventError`."""
-        self.shape = _positive("shape[0]", shape[0]), _positive("shape[1]", shape[1])
+        height, width = (_positive(f"shape[{place}]", side, LARGEST_SIDE_PX) for place, side in enumerate(shape))
+        self.shape = height, width
         self.window_us = _positive("window_us", window_us)
         self.step_us = self.window_us if step_us is None else _positive("step_us", step_us)
         if self.step_us > self.window_us:
@@ -150,13 +154,13 @@ def events_to_frames(
     return starts, frames
 
 
-def _positive(name: str, value: int) -> int:
+def _positive(name: str, value: int, largest: int = LARGEST_TIME_US) -> int:
     try:
         number = operator.index(value)
     except TypeError:
         number = 0
-    if not 0 < number <= LARGEST_TIME_US:
-        raise EventError(f"{name}: found {value!r}; give a whole number above 0")
+    if not 0 < number <= largest:
+        raise EventError(f"{name}: found {value!r}; give a whole number above 0, at most {largest}")
     return number
 
 

@@ -61,6 +61,9 @@ BINARY_DAT_HEADER_BYTES = 2
 COLUMN_NAMES = {"t": "t", "x": "x", "y": "y", "p": "p", "on": "p", "polarity": "p"}
 EVT_VERSIONS = {"2.0": "evt2", "EVT2": "evt2", "3.0": "evt3", "EVT3": "evt3"}
 LONGEST_HEADER_BYTES = 65_536
+LONGEST_SIDE_DIGITS = 9
+"""Digits of a height or width in a header; more are no size."""
+NPZ_WANTED, HDF5_WANTED = "an npz file with arrays t, x, y, p", "an HDF5 file with columns t, x, y, p"
 
 
 class RecordingError(ValueError):
@@ -111,7 +114,7 @@ def sensor_shape(path: str | Path) -> tuple[int, int] | None:
     if path.suffix == ".npz":
         return None
     if path.suffix in HDF5_SUFFIXES:
-        with _hdf5_file(path) as file:
+        with _read_or_refused(path, HDF5_WANTED), _hdf5_file(path) as file:
             holder, _ = _hdf5_columns(path, file)
             return _shape(*(str(holder.attrs.get(name, "")) for name in ("height", "width")))
     known = ", ".join((*FAERY_SUFFIXES, ".csv", ".npz", *HDF5_SUFFIXES))
@@ -143,7 +146,8 @@ def _header_shape(header: dict[str, str]) -> tuple[int, int] | None:
 
 
 def _shape(height: str, width: str) -> tuple[int, int] | None:
-    return (int(height), int(width)) if height.isdecimal() and width.isdecimal() else None
+    usable = all(side.isdecimal() and len(side) <= LONGEST_SIDE_DIGITS for side in (height, width))
+    return (int(height), int(width)) if usable else None
 
 
 def _faery_packets(path: Path, shape: tuple[int, int] | None) -> Iterator[NDArray[Any]]:
@@ -272,21 +276,27 @@ def _packet(t: NDArray[Any], x: NDArray[Any], y: NDArray[Any], p: NDArray[Any]) 
     return packet
 
 
+@contextlib.contextmanager
+def _read_or_refused(path: Path, wanted: str) -> Iterator[None]:
+    """Makes a `RecordingError` of whatever a damaged file makes zipfile, zlib or HDF5 raise: classes of their own, and built-in ones."""
+    try:
+        yield
+    except RecordingError:
+        raise
+    except Exception as error:
+        raise RecordingError(f"{path}: cannot be read ({_one_line(error)}); give {wanted}") from error
+
+
 def _npz_packets(path: Path) -> Iterator[NDArray[Any]]:
     """Reads the four arrays side by side, a packet at a time, without unpacking the whole of one."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            names = archive.namelist()
-            missing = [name for name in "txyp" if f"{name}.npy" not in names]
-            lengths, dtypes = {}, {}
-            for name in (name for name in "txyp" if name not in missing):
-                with archive.open(f"{name}.npy") as file:
-                    shape, _, dtypes[name] = _npy_header(file)
-                lengths[name] = _column_length(path, name, dtypes[name], shape)
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError, NotImplementedError) as error:
-        if isinstance(error, RecordingError):
-            raise
-        raise RecordingError(f"{path}: cannot be read ({_one_line(error)}); give an npz file with arrays t, x, y, p") from error
+    with _read_or_refused(path, NPZ_WANTED), zipfile.ZipFile(path) as archive:
+        names = archive.namelist()
+        missing = [name for name in "txyp" if f"{name}.npy" not in names]
+        lengths, dtypes = {}, {}
+        for name in (name for name in "txyp" if name not in missing):
+            with archive.open(f"{name}.npy") as file:
+                shape, _, dtypes[name] = _npy_header(file)
+            lengths[name] = _column_length(path, name, dtypes[name], shape)
     if missing:
         raise RecordingError(f"{path}: no array {', '.join(missing)}; the arrays t, x, y, p are needed")
     _check_lengths(path, lengths)
@@ -325,10 +335,8 @@ def _hdf5_file(path: Path) -> Any:
         import h5py
     except ModuleNotFoundError as error:
         raise RecordingError(f"{path}: {path.suffix} needs h5py, which is not installed: pip install glideproof[recordings]") from error
-    try:
+    with _read_or_refused(path, HDF5_WANTED):
         return h5py.File(path, "r")
-    except OSError as error:
-        raise RecordingError(f"{path}: cannot be read ({_one_line(error)}); give an HDF5 file with columns t, x, y, p") from error
 
 
 def _hdf5_columns(path: Path, file: Any) -> tuple[Any, dict[str, Any]]:
@@ -342,12 +350,15 @@ def _hdf5_columns(path: Path, file: Any) -> tuple[Any, dict[str, Any]]:
         else:
             continue
         if set("txyp") <= set(names):
-            return holder, {name: column(name) for name in "txyp"}
+            columns = {name: column(name) for name in "txyp"}
+            if damaged := [name for name in columns if not hasattr(columns[name], "__getitem__")]:
+                raise RecordingError(f"{path}: {', '.join(damaged)} cannot be read; the file is damaged")
+            return holder, columns
     raise RecordingError(f"{path}: no columns t, x, y, p at the top or in a group 'events'; found {', '.join(file) or 'nothing'}")
 
 
 def _hdf5_packets(path: Path) -> Iterator[NDArray[Any]]:
-    with _hdf5_file(path) as file:
+    with _read_or_refused(path, HDF5_WANTED), _hdf5_file(path) as file:
         holder, columns = _hdf5_columns(path, file)
         if hasattr(holder, "dtype"):
             lengths = {name: _column_length(path, name, holder.dtype[name], holder.shape) for name in columns}

@@ -314,3 +314,76 @@ def test_weights_in_another_file_are_refused(tmp_path: Path) -> None:
     assert (tmp_path / "weights").exists()
     with pytest.raises(EstimatorError):
         user_network(ONE_CELL, tmp_path / "user.onnx")
+
+
+def small_network(*nodes: onnx.NodeProto, **tensors: np.ndarray) -> onnx.ModelProto:
+    """NN_e of these nodes, `image` to `state`."""
+    infos = [[helper.make_tensor_value_info(*value)] for value in (("image", *IMAGE), ("state", *STATE))]
+    graph = helper.make_graph(list(nodes), "user", *infos, [numpy_helper.from_array(value, name) for name, value in tensors.items()])
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=8)
+
+
+ANSWER = np.ones((1, 4), dtype=np.float32)
+DYNAMIC_INSIDE = {
+    "a slice whose end is computed": (
+        [
+            helper.make_node("ArgMax", ["image"], ["row"], axis=2),
+            helper.make_node("Reshape", ["row", "one"], ["short"]),
+            helper.make_node("Slice", ["short", "zero", "first", "zero"], ["first_row"]),
+            helper.make_node("Slice", ["image", "zero", "first_row", "two"], ["cut"]),
+            helper.make_node("ReduceSum", ["cut"], ["sum"], keepdims=0),
+        ],
+        r"found 'cut' \(Slice\), FLOAT \[.*'.*'\]; expected fixed shapes throughout",
+    ),
+    "as many as are lit": (
+        [
+            helper.make_node("NonZero", ["image"], ["places"]),
+            helper.make_node("Cast", ["places"], ["numbers"], to=TensorProto.FLOAT),
+            helper.make_node("ReduceSum", ["numbers"], ["sum"], keepdims=0),
+        ],
+        r"found 'places' \(NonZero\), INT64 \[4, '.*'\]; expected fixed shapes throughout",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", DYNAMIC_INSIDE)
+def test_a_network_that_is_dynamic_inside_is_refused(tmp_path: Path, case: str) -> None:
+    """Between an input and an output of fixed shapes."""
+    nodes, message = DYNAMIC_INSIDE[case]
+    sizes = {"zero": np.array([0]), "first": np.array([1]), "two": np.array([2]), "one": np.array([-1])}
+    model = small_network(*nodes, helper.make_node("Mul", ["sum", "answer"], ["state"]), answer=ANSWER, **sizes)
+    onnx.save(model, tmp_path / "user.onnx")
+    with pytest.raises(EstimatorError, match=message) as caught:
+        user_network(ONE_CELL, tmp_path / "user.onnx")
+    assert str(caught.value).startswith(str(tmp_path / "user.onnx"))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_network_that_the_runtime_would_refuse_is_refused(tmp_path: Path) -> None:
+    """Expand, of a constant shape: the runtime takes no operator that makes a tensor from a number."""
+    nodes = [
+        helper.make_node("ReduceMean", ["image"], ["mean"], keepdims=0),
+        helper.make_node("Expand", ["mean", "shape"], ["state"]),
+    ]
+    onnx.save(small_network(*nodes, shape=np.array([1, 4])), tmp_path / "user.onnx")
+    with pytest.raises(EstimatorError, match="found the operator Expand; a model has static, standard operators only"):
+        user_network(ONE_CELL, tmp_path / "user.onnx")
+
+
+def test_constants_of_any_kind_become_what_the_runtime_reads(tmp_path: Path) -> None:
+    """A Constant as a tensor and as numbers, typed data, and a constant that is an input too, as older exporters write them."""
+    nodes = [
+        helper.make_node("Constant", [], ["axes"], value_ints=[0, 1, 2, 3]),
+        helper.make_node("Constant", [], ["half"], value=helper.make_tensor("half", TensorProto.FLOAT, [], [0.5])),
+        helper.make_node("ReduceMean", ["image", "axes"], ["mean"], keepdims=0),
+        helper.make_node("Mul", ["mean", "half"], ["scaled"]),
+        helper.make_node("Mul", ["scaled", "answer"], ["state"]),
+    ]
+    model = small_network(*nodes)
+    model.graph.initializer.append(helper.make_tensor("answer", TensorProto.FLOAT, [1, 4], [1.0, 2.0, 3.0, 4.0]))
+    model.graph.input.append(helper.make_tensor_value_info("answer", *STATE))
+    onnx.save(model, tmp_path / "user.onnx")
+    export_model(ONE_CELL, tmp_path / "model.onnx", estimator=tmp_path / "user.onnx")
+    outputs = Estimator.load(tmp_path / "model.onnx").run(np.ones((HEIGHT, WIDTH), dtype=bool))
+    share = outputs["filtered"].mean() / 2
+    assert outputs["network_state"] == pytest.approx(share * np.arange(1, 5), rel=1e-5)

@@ -183,3 +183,10 @@ def test_unusable_sizes_are_refused(arguments, message):
 def test_one_call_refuses_events_outside_the_sensor():
     with pytest.raises(EventError, match="found 1 events outside a sensor of shape"):
         events_to_frames(events_of([(0, 0, 0, 1), (1, SHAPE[1], 0, 1)]), SHAPE, 10)
+
+
+@pytest.mark.parametrize("shape", [(2**61, 3), (10, 16385)])
+def test_a_sensor_larger_than_any_camera_is_refused_before_a_frame_is_made(shape):
+    """Found by fuzzing: a frame of 6 EiB."""
+    with pytest.raises(EventError, match=r"^shape\[[01]\]: found \d+; give a whole number above 0, at most 16384$"):
+        FrameStream(shape, 1000)

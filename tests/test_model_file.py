@@ -4,18 +4,32 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 
 from runtime.estimator import BOX_TENSORS, Estimator
-from runtime.model_file import FORMAT_VERSION, METADATA_KEY, ModelError, metadata_digest, parse_model
+from runtime.model_file import (
+    FORMAT_VERSION,
+    LARGEST_FIELDS,
+    LARGEST_FILE_BYTES,
+    LARGEST_METADATA_BYTES,
+    METADATA_KEY,
+    OPERATORS,
+    ModelError,
+    check_graph,
+    metadata_digest,
+    parse_model,
+)
 
 ModelOf = Callable[[str], Path]
 
@@ -148,3 +162,259 @@ def test_the_digest_that_a_caller_trusts_decides(model_of: ModelOf) -> None:
 def test_garbage_is_refused_with_a_model_error(garbage: bytes) -> None:
     with pytest.raises(ModelError):
         parse_model(garbage, "garbage")
+
+
+# --- an attacker's files: every digest is right, and nothing else need be ---
+
+
+def forged(content: bytes, change: Callable[[onnx.ModelProto], object], **metadata: object) -> bytes:
+    """The model changed, with entries of its metadata replaced and all digests computed anew."""
+    model = onnx.ModelProto.FromString(content)
+    change(model)
+    return with_metadata(model.SerializeToString(), graph_sha256=hashlib.sha256(model.graph.SerializeToString()).hexdigest(), **metadata)
+
+
+def initialiser(model: onnx.ModelProto, name: str) -> onnx.TensorProto:
+    return next(tensor for tensor in model.graph.initializer if tensor.name == name)
+
+
+def node(model: onnx.ModelProto, operator: str) -> onnx.NodeProto:
+    return next(node for node in model.graph.node if node.op_type == operator)
+
+
+def reshaped(*dims: int) -> Callable[[onnx.ModelProto], object]:
+    def change(model: onnx.ModelProto) -> None:
+        tensor = initialiser(model, "state_lower")
+        tensor.ClearField("dims")
+        tensor.dims.extend(dims)
+
+    return change
+
+
+def replaced(name: str, values: np.ndarray) -> Callable[[onnx.ModelProto], object]:
+    return lambda model: initialiser(model, name).CopyFrom(numpy_helper.from_array(values, name))
+
+
+def external(model: onnx.ModelProto) -> None:
+    tensor = initialiser(model, "state_lower")
+    tensor.ClearField("raw_data")
+    tensor.data_location = TensorProto.EXTERNAL
+    tensor.external_data.add(key="location", value="/etc/passwd")
+
+
+def typed(model: onnx.ModelProto) -> None:
+    tensor = initialiser(model, "state_lower")
+    tensor.ClearField("raw_data")
+    tensor.float_data.append(0.0)
+
+
+def branching(model: onnx.ModelProto) -> None:
+    body = helper.make_graph([helper.make_node("Identity", ["frame"], ["y"])], "body", [], [])
+    node(model, "Relu").attribute.append(helper.make_attribute("then_branch", body))
+
+
+def computed_shape(model: onnx.ModelProto) -> None:
+    node(model, "Reshape").input[1] = "cell"
+
+
+def tensor_in_a_node(model: onnx.ModelProto) -> None:
+    node(model, "Cast").attribute.append(helper.make_attribute("value", numpy_helper.from_array(np.zeros(3), "t")))
+
+
+def of_domain(model: onnx.ModelProto) -> None:
+    node(model, "Relu").domain = "com.microsoft"
+
+
+def with_function(model: onnx.ModelProto) -> None:
+    model.functions.append(helper.make_function("f", "F", ["a"], ["b"], [helper.make_node("Relu", ["a"], ["b"])], []))
+
+
+ATTACKS: dict[str, tuple[Callable[[onnx.ModelProto], object], str]] = {
+    "a constant of a terabyte": (reshaped(4, 2**38), r"constant state_lower with shape \[4, 274877906944\], type 1, \d+ bytes of data"),
+    "a size that is 0 in 64 bits": (reshaped(2**32, 2**32), "constant state_lower with shape"),
+    "a negative size": (reshaped(-1, 4), "constant state_lower with shape"),
+    "no elements of endless rows": (reshaped(0, 2**62), "constant state_lower with shape"),
+    "too many axes": (reshaped(*[1] * 100), "constant state_lower with shape"),
+    "texts": (lambda model: setattr(initialiser(model, "state_lower"), "data_type", TensorProto.STRING), "type 8"),
+    "weights in another file": (external, "found external_data in a constant"),
+    "typed data": (typed, "found float_data in a constant"),
+    "sparse constants": (lambda model: model.graph.sparse_initializer.add().dims.append(2**40), "found sparse_initializer in a graph"),
+    "two constants of a name": (lambda model: model.graph.initializer.append(model.graph.initializer[0]), "two constants rows_and_columns"),
+    "functions": (with_function, "found functions"),
+    "another domain": (of_domain, "operator Relu of com.microsoft"),
+    "another operator set": (lambda model: model.opset_import.append(helper.make_opsetid("com.microsoft", 1)), "found operator sets"),
+    "an old operator set": (lambda model: setattr(model.opset_import[0], "version", 9), "found operator sets"),
+    "a graph in a node": (branching, "found a graph in an attribute"),
+    "a tensor in a node": (tensor_in_a_node, "found a tensor in an attribute"),
+    "a computed shape": (computed_shape, "Reshape with a shape that is computed, cell"),
+    "a padding of terabytes": (replaced("border", np.array([2**40, 0, 0, 2**40])), "found a Pad by"),
+    **{
+        operator: (lambda model, operator=operator: setattr(node(model, "Relu"), "op_type", operator), f"found the operator {operator};")
+        for operator in ("Expand", "Tile", "Range", "ConstantOfShape", "Resize", "Loop", "If", "Scan", "NonZero", "x" * 40)
+    },
+}
+
+
+@pytest.fixture
+def no_session(monkeypatch: pytest.MonkeyPatch) -> None:
+    """onnxruntime must not see the file."""
+
+    def seen(*_arguments: object, **_options: object) -> None:
+        pytest.fail("onnxruntime was given the file")
+
+    monkeypatch.setattr(onnxruntime, "InferenceSession", seen)
+
+
+@pytest.mark.usefixtures("no_session")
+@pytest.mark.parametrize("attack", ATTACKS)
+def test_a_forged_model_is_refused_before_anything_is_made_of_it(content: bytes, tmp_path: Path, attack: str) -> None:
+    """One line that says what was found; memory no more than a few copies of the file."""
+    change, message = ATTACKS[attack]
+    path = tmp_path / "forged.onnx"
+    path.write_bytes(forged(content, change))
+    tracemalloc.start()
+    with pytest.raises(ModelError, match=message) as caught:
+        Estimator.load(path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert str(caught.value).startswith(f"{path}: ")
+    assert str(caught.value).isprintable()
+    assert peak < 4 * len(content) + 2**20
+
+
+@pytest.mark.usefixtures("no_session")
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (replaced("state_lower", np.zeros((4, 2, 3), dtype=np.float32)), r"state_lower is float32 \[4, 2, 3\], its scene asks for float32"),
+        (replaced("line_lower", np.zeros((1, 9, 4), dtype=np.float32)), "line_lower is float32"),
+        (replaced("window_first", np.array([-1, 0])), "its window or its spatial masks lie outside the frame"),
+        (replaced("window_stop", np.array([10_000, 10_000])), "its window or its spatial masks lie outside the frame"),
+        (replaced("spatial_run_index", np.zeros(3, dtype=np.int32)), "spatial_run_cell is int32"),
+        (lambda model: replaced("reference_row", np.full(initialiser(model, "reference_row").dims, np.nan))(model), "not finite"),
+    ],
+)
+def test_constants_that_do_not_fit_the_scene_are_refused(
+    content: bytes, tmp_path: Path, change: Callable[[onnx.ModelProto], object], message: str
+) -> None:
+    path = tmp_path / "forged.onnx"
+    path.write_bytes(forged(content, change))
+    with pytest.raises(ModelError, match=message):
+        Estimator.load(path)
+
+
+@pytest.mark.usefixtures("no_session")
+def test_scenes_that_do_not_fit_the_constants_are_refused(content: bytes, tmp_path: Path) -> None:
+    """A camera of a terapixel, and a domain of a million million cells, of which the file has none."""
+    scene = json.loads(onnx.ModelProto.FromString(content).metadata_props[0].value)["scene"]
+    many = {"centres": [1.0 + place / 1000 for place in range(1000)], "width": 0.001}
+    huge = {**scene["camera"], "width": 10**6}
+    domain = {**scene["domain"], "x_m": many, "y_m": many, "z_m": many}
+    cases = {
+        r"scene in its metadata is unusable \(camera\.width: found 1000000;": {"scene": {**scene, "camera": huge}},
+        "its scene asks for int32 \\[1000000000,": {"scene": {**scene, "domain": domain}},
+        "misstate the smallest": {"smallest_must_light": 10**9},
+        "lack smallest_must_light": {"smallest_must_light": "9"},
+        "scene in its metadata is unusable": {"scene": None},
+    }
+    path = tmp_path / "forged.onnx"
+    for message, changes in cases.items():
+        path.write_bytes(with_metadata(content, **changes))
+        with pytest.raises(ModelError, match=message):
+            Estimator.load(path)
+
+
+def test_inputs_and_outputs_other_than_the_scenes_are_refused(content: bytes, tmp_path: Path) -> None:
+    """An output that is missing, or of another shape than is declared: shapes are inferred, not believed."""
+
+    def without_cell(model: onnx.ModelProto) -> None:
+        model.graph.output.remove(next(value for value in model.graph.output if value.name == "cell"))
+
+    def wider_state(model: onnx.ModelProto) -> None:
+        value = next(value for value in model.graph.output if value.name == "network_state")
+        value.type.tensor_type.shape.dim[0].dim_value = 5
+
+    def another_input(model: onnx.ModelProto) -> None:
+        model.graph.input.append(helper.make_tensor_value_info("more", TensorProto.FLOAT, [2**40]))
+
+    path = tmp_path / "forged.onnx"
+    for change, message in (
+        (without_cell, "its outputs are"),
+        (wider_state, "cannot load it|its outputs are"),
+        (another_input, "its inputs are"),
+    ):
+        path.write_bytes(forged(content, change))
+        with pytest.raises(ModelError, match=message):
+            Estimator.load(path)
+
+
+def test_a_model_that_fails_when_it_runs_is_a_model_error(content: bytes, tmp_path: Path) -> None:
+    """Found by fuzzing: an index beyond its data is noticed by onnxruntime only when it looks there."""
+    path = tmp_path / "forged.onnx"
+    size = onnx.numpy_helper.to_array(initialiser(onnx.ModelProto.FromString(content), "must_light_place")).size
+    path.write_bytes(forged(content, replaced("must_light_place", np.full(size, 2**30, dtype=np.int32))))
+    estimator = Estimator.load(path)
+    with pytest.raises(ModelError, match="onnxruntime cannot run it") as caught:
+        estimator.estimate(np.zeros(estimator.scene.camera.shape, dtype=bool))
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.usefixtures("no_session")
+def test_messages_that_protocol_buffers_would_merge_are_refused(content: bytes) -> None:
+    """A second graph, or a second operator in a node, would be checked here and overruled there."""
+    graph = onnx.ModelProto.FromString(content).graph
+    with pytest.raises(ModelError, match="found graph twice in a file"):
+        parse_model(content + b"\x3a\x02\x12\x00", "model")
+    twice = graph.node[0].SerializeToString() + b"\x22\x04Loop"
+    assert onnx.NodeProto.FromString(twice).op_type == "Loop"
+    with pytest.raises(ModelError, match="found op_type twice in a node"):
+        check_graph(b"\x0a" + bytes([len(twice)]) + twice)
+
+
+@pytest.mark.usefixtures("no_session")
+def test_sizes_are_limited_before_anything_is_read(content: bytes, tmp_path: Path) -> None:
+    """A file of 2^40 bytes, all of them a hole; a pipe; metadata and numbers of fields beyond the limits."""
+    large, pipe = tmp_path / "large.onnx", tmp_path / "pipe.onnx"
+    with large.open("wb") as file:
+        file.truncate(min(2**40, 2 * LARGEST_FILE_BYTES))
+    os.mkfifo(pipe)
+    for path in (large, pipe):
+        with pytest.raises(ModelError, match=r"onnx: cannot be read \(not a file, or of \d+ bytes\); files of up to 256 MiB"):
+            Estimator.load(path)
+    with pytest.raises(ModelError, match=r"found metadata of \d+ bytes; at most"):
+        parse_model(with_metadata(content, assumptions=["x" * LARGEST_METADATA_BYTES]), "model")
+    with pytest.raises(ModelError, match=f"found more than {LARGEST_FIELDS} fields"):
+        check_graph(b"\x0a\x00" * (LARGEST_FIELDS + 1))
+
+
+@pytest.mark.usefixtures("no_session")
+def test_the_callers_digest_is_compared_before_the_file_is_parsed(tmp_path: Path) -> None:
+    (tmp_path / "garbage.onnx").write_bytes(b"garbage")
+    with pytest.raises(ModelError, match="the caller trusts"):
+        Estimator.load(tmp_path / "garbage.onnx", sha256="0" * 64)
+
+
+def test_every_operator_that_is_taken_is_standard_and_keeps_to_its_inputs() -> None:
+    """None has a graph among its attributes or gives anything but tensors; none takes a size as a value, but through constants."""
+    for operator in OPERATORS:
+        schema = onnx.defs.get_schema(operator, 20)
+        kinds = {attribute.type for attribute in schema.attributes.values()}
+        assert not kinds & {onnx.defs.OpSchema.AttrType.GRAPH, onnx.defs.OpSchema.AttrType.GRAPHS}
+        assert not schema.deprecated
+    assert not OPERATORS & {
+        "Constant",
+        "ConstantOfShape",
+        "EyeLike",
+        "Expand",
+        "Tile",
+        "OneHot",
+        "Range",
+        "Resize",
+        "RandomNormal",
+        "Shape",
+    }
+
+
+@pytest.mark.parametrize("name", ["paper", "free x", "tolerant, cut left"])
+def test_every_model_of_ours_is_taken(model_of: ModelOf, name: str) -> None:
+    assert Estimator.load(model_of(name)).metadata["seed"] == 1

@@ -332,3 +332,41 @@ def test_an_aedat4_file_that_breaks_faery_down_is_an_error_of_one_line(tmp_path)
         faults.append(read_until_a_fault(path)[1])
     assert all(fault == "" or fault.startswith(f"{path}: ") for fault in faults)
     assert any(faults)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_an_npz_file_with_changed_bytes_is_read_or_refused(tmp_path, packed):
+    """Found by fuzzing: zlib's own error, where the start of an array is damaged."""
+    events, drawn, faults = random_events(50), np.random.default_rng(0), set()
+    path = tmp_path / "a.npz"
+    (np.savez_compressed if packed else np.savez)(path, **{name: events[name] for name in EVENT.names})
+    whole = path.read_bytes()
+    for _ in range(300):
+        content = bytearray(whole)
+        content[int(drawn.integers(len(content)))] ^= 1 << int(drawn.integers(8))
+        path.write_bytes(bytes(content))
+        faults.add(read_until_a_fault(path)[1].replace(str(path), "")[:60])
+    assert len(faults) > 2
+
+
+def test_an_hdf5_file_with_changed_bytes_is_read_or_refused(tmp_path):
+    """Found by fuzzing: RuntimeError for a broken group, and a name in a group that leads nowhere."""
+    h5py = pytest.importorskip("h5py", reason="the extra 'recordings' is not installed")
+    events, drawn, faults = random_events(50), np.random.default_rng(0), set()
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        for name in EVENT.names:
+            file.create_dataset(name, data=events[name], chunks=True, compression="gzip")
+    whole = path.read_bytes()
+    for _ in range(300):
+        content = bytearray(whole)
+        for place in drawn.integers(len(content), size=20):
+            content[int(place)] ^= 1 << int(drawn.integers(8))
+        path.write_bytes(bytes(content))
+        faults.add(read_until_a_fault(path)[1].replace(str(path), "")[:60])
+    assert len(faults) > 2
+
+
+def test_a_header_with_a_size_of_endless_digits_tells_no_size(tmp_path):
+    (tmp_path / "a.raw").write_bytes(b"% evt 3.0\n% Width " + b"9" * 5000 + b"\n% Height 10\n% end\n")
+    assert sensor_shape(tmp_path / "a.raw") is None

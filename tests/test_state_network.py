@@ -6,7 +6,6 @@ import io
 import json
 from collections.abc import Callable
 from dataclasses import asdict, replace
-from typing import Any
 
 import numpy as np
 import onnx
@@ -15,7 +14,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from rich.console import Console
-from torch import Tensor
+from rounding_bound import exact_state_and_bound
 from torch.nn import functional
 
 from build_model.export import build_banks, filter_function
@@ -43,7 +42,6 @@ from runtime.scene import Axis, Bank, Camera, Domain, EstimatorTraining, Marking
 
 Filter = Callable[[NDArray[np.uint8]], NDArray[np.uint8]]
 RandomStates = Callable[[Scene, int, int], NDArray[np.float64]]
-FLOAT32_ROUNDING = 2.0**-24
 
 SMALL = Scene(
     Camera(width=160, height=120, focal_length_m=0.008, pixel_pitch_m=60e-6),
@@ -297,33 +295,6 @@ def test_low_and_high_windows_get_as_many_convolutions_as_they_need(paper_scene:
 # --- the export ---
 
 
-def rounding_bound(network: StateNetwork, frame: Tensor) -> NDArray[np.float64]:
-    """What float32, in any order of the sums, may add to each output: gamma_n (|W| |x| + |b|) a layer, carried on through |W|."""
-    layers: list[tuple[Any, Any]] = [(network.first.halves, lambda x, w, b: _row_convolution(x, w, b).unsqueeze(2))]
-    layers += [(layer, lambda x, w, b: functional.conv2d(x, w, b, stride=(1, 2))) for layer in network.convolutions]
-    layers += [(layer, lambda x, w, b: functional.linear(x.flatten(1), w, b)) for layer in (network.hidden, network.last)]
-    rows, columns = network.window.slices
-    exact = functional.pad(frame[:, 0, rows, columns].double(), (0, 0, 0, network.padding))
-    error = torch.zeros_like(exact)
-    for position, (layer, apply) in enumerate(layers):
-        weight, bias = layer.weight.double(), layer.bias.double()
-        terms = weight[0].numel() + 3
-        gamma = terms * FLOAT32_ROUNDING / (1 - terms * FLOAT32_ROUNDING)
-        carried = apply(error, weight.abs(), torch.zeros_like(bias))
-        error = carried + gamma * (apply(exact.abs(), weight.abs(), bias.abs()) + carried)
-        exact = apply(exact, weight, bias)
-        exact = exact if position == len(layers) - 1 else exact.relu()
-    scaled = network.half_width.double() * (exact.abs() + error)
-    total = network.half_width.double() * error + 3 * FLOAT32_ROUNDING * (network.middle.double().abs() + scaled)
-    return total[0].numpy()
-
-
-def _row_convolution(image: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    halves = functional.linear(image.reshape(len(image), image.shape[1] // BLOCK_ROWS, -1), weight, bias)
-    channels = len(bias) // 2
-    return (halves[:, :-1, :channels] + halves[:, 1:, channels:]).transpose(1, 2)
-
-
 @pytest.mark.parametrize("opset", [18, OPSET])
 def test_the_export_agrees_with_torch_up_to_float32(
     opset: int, trained: tuple[StateNetwork, TrainingReport], small_filter: Filter, random_states: RandomStates
@@ -342,12 +313,13 @@ def test_the_export_agrees_with_torch_up_to_float32(
             image = frame[None, None]
             state = np.asarray(session.run(None, {session.get_inputs()[0].name: image})[0])
             with torch.no_grad():
-                expected = network(torch.from_numpy(image))
-                bound = rounding_bound(network, torch.from_numpy(image))
-            assert state.dtype == np.float32
-            difference = np.abs(state[0].astype(np.float64) - expected[0].numpy())
-            assert (difference <= 2 * bound).all()
-            assert (difference <= 1e-5).all()
+                of_torch = network(torch.from_numpy(image)).numpy()
+            exact, bound = exact_state_and_bound(network, torch.from_numpy(image))
+            assert state.dtype == of_torch.dtype == np.float32
+            for found in (state, of_torch):
+                difference = np.abs(found[0].astype(np.float64) - exact)
+                assert (difference <= bound).all()
+                assert (difference <= 1e-5).all()
             assert state[0, 1] == np.float32(0.1)
 
 

@@ -740,5 +740,5 @@ def test_a_graph_given_twice_is_unusable(model: Model, tmp_path: Path) -> None:
     extra = onnx.ModelProto()
     extra.graph.node.add(op_type="Identity", input=["frame"], output=["extra"])
     path.write_bytes(extra.SerializeToString() + path.read_bytes())
-    with pytest.raises(ModelError, match=r"more than once|not a valid"):
+    with pytest.raises(ModelError, match=r"graph twice in a file"):
         verify_model(path)
