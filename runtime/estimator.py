@@ -394,7 +394,7 @@ def _check_tensors(scene: Scene, tensors: dict[str, NDArray[Any]], name: str) ->
             raise ModelError(f"{name}: {label} is {found.dtype} {list(found.shape)}, its scene asks for {expected}; export it again")
         if not np.isfinite(found).all():
             raise ModelError(f"{name}: {label} holds values that are not finite; export it again with export-model")
-    if not np.array_equal(np.unique(tensors["row_cell"]), np.arange(cells)):
+    if rows[0] < cells or not np.array_equal(np.unique(tensors["row_cell"]), np.arange(cells)):
         raise ModelError(f"{name}: row_cell does not give rows to every one of {cells} cells; export it again with export-model")
     first, stop = tensors["window_first"], tensors["window_stop"]
     inside = bool(((first >= 0) & (first < stop) & (stop <= scene.camera.shape)).all())

@@ -274,9 +274,8 @@ def with_shifted_entries(path: Path, to: Path, by: float) -> Path:
     proto = onnx.load(path)
     metadata = json.loads(proto.metadata_props[0].value)
     for tensor in proto.graph.initializer:
-        if tensor.name in ("state_lower", "state_upper"):
-            values = numpy_helper.to_array(tensor).copy()
-            values[3] += by
+        if tensor.name in ("z_lower", "z_upper"):
+            values = numpy_helper.to_array(tensor) + np.float32(by)
             tensor.CopyFrom(numpy_helper.from_array(values, tensor.name))
     metadata["graph_sha256"] = hashlib.sha256(proto.graph.SerializeToString(deterministic=True)).hexdigest()
     metadata["metadata_sha256"] = metadata_digest(metadata)

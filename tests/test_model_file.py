@@ -184,7 +184,7 @@ def node(model: onnx.ModelProto, operator: str) -> onnx.NodeProto:
 
 def reshaped(*dims: int) -> Callable[[onnx.ModelProto], object]:
     def change(model: onnx.ModelProto) -> None:
-        tensor = initialiser(model, "state_lower")
+        tensor = initialiser(model, "theta_lower")
         tensor.ClearField("dims")
         tensor.dims.extend(dims)
 
@@ -196,14 +196,14 @@ def replaced(name: str, values: np.ndarray) -> Callable[[onnx.ModelProto], objec
 
 
 def external(model: onnx.ModelProto) -> None:
-    tensor = initialiser(model, "state_lower")
+    tensor = initialiser(model, "theta_lower")
     tensor.ClearField("raw_data")
     tensor.data_location = TensorProto.EXTERNAL
     tensor.external_data.add(key="location", value="/etc/passwd")
 
 
 def typed(model: onnx.ModelProto) -> None:
-    tensor = initialiser(model, "state_lower")
+    tensor = initialiser(model, "theta_lower")
     tensor.ClearField("raw_data")
     tensor.float_data.append(0.0)
 
@@ -230,12 +230,12 @@ def with_function(model: onnx.ModelProto) -> None:
 
 
 ATTACKS: dict[str, tuple[Callable[[onnx.ModelProto], object], str]] = {
-    "a constant of a terabyte": (reshaped(4, 2**38), r"constant state_lower with shape \[4, 274877906944\], type 1, \d+ bytes of data"),
-    "a size that is 0 in 64 bits": (reshaped(2**32, 2**32), "constant state_lower with shape"),
-    "a negative size": (reshaped(-1, 4), "constant state_lower with shape"),
-    "no elements of endless rows": (reshaped(0, 2**62), "constant state_lower with shape"),
-    "too many axes": (reshaped(*[1] * 100), "constant state_lower with shape"),
-    "texts": (lambda model: setattr(initialiser(model, "state_lower"), "data_type", TensorProto.STRING), "type 8"),
+    "a constant of a terabyte": (reshaped(4, 2**38), r"constant theta_lower with shape \[4, 274877906944\], type 1, \d+ bytes of data"),
+    "a size that is 0 in 64 bits": (reshaped(2**32, 2**32), "constant theta_lower with shape"),
+    "a negative size": (reshaped(-1, 4), "constant theta_lower with shape"),
+    "no elements of endless rows": (reshaped(0, 2**62), "constant theta_lower with shape"),
+    "too many axes": (reshaped(*[1] * 100), "constant theta_lower with shape"),
+    "texts": (lambda model: setattr(initialiser(model, "theta_lower"), "data_type", TensorProto.STRING), "type 8"),
     "weights in another file": (external, "found external_data in a constant"),
     "typed data": (typed, "found float_data in a constant"),
     "sparse constants": (lambda model: model.graph.sparse_initializer.add().dims.append(2**40), "found sparse_initializer in a graph"),
@@ -286,7 +286,7 @@ def test_a_forged_model_is_refused_before_anything_is_made_of_it(content: bytes,
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (replaced("state_lower", np.zeros((4, 2, 3), dtype=np.float32)), r"state_lower is float32 \[4, 2, 3\], its scene asks for float32"),
+        (replaced("theta_lower", np.zeros((2, 3), dtype=np.float32)), r"theta_lower is float32 \[2, 3\], its scene asks for float32"),
         (replaced("line_lower", np.zeros((1, 9, 4), dtype=np.float32)), "line_lower is float32"),
         (replaced("window_first", np.array([-1, 0])), "its window or its spatial masks lie outside the frame"),
         (replaced("window_stop", np.array([10_000, 10_000])), "its window or its spatial masks lie outside the frame"),
@@ -312,7 +312,7 @@ def test_scenes_that_do_not_fit_the_constants_are_refused(content: bytes, tmp_pa
     domain = {**scene["domain"], "x_m": many, "y_m": many, "z_m": many}
     cases = {
         r"scene in its metadata is unusable \(camera\.width: found 1000000;": {"scene": {**scene, "camera": huge}},
-        "its scene asks for int32 \\[1000000000,": {"scene": {**scene, "domain": domain}},
+        "rows to every one of 1000000000 cells": {"scene": {**scene, "domain": domain}},
         "misstate the smallest": {"smallest_must_light": 10**9},
         "lack smallest_must_light": {"smallest_must_light": "9"},
         "scene in its metadata is unusable": {"scene": None},
