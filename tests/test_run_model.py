@@ -124,6 +124,23 @@ def test_windows_may_overlap_and_the_budget_be_changed(recording, tmp_path):
     assert [int(row["time_us"]) for row in rows_of(tmp_path)] == [20_000 * number for number in range(2 * WINDOWS)]
 
 
+def test_windows_are_judged_by_the_budget_that_was_given(events, truth, estimator, tmp_path):
+    image = runway_image(estimator.scene, STATES[3]) != 0
+    row, column = np.argwhere(image)[20]
+    dead = (events["y"] == row) & (events["x"] == column)
+    changed = events[~(dead & (events["t"] >= 120_000) & (events["t"] < 160_000))]
+    np.savez(tmp_path / "a.npz", t=changed["t"], x=changed["x"], y=changed["y"], p=changed["p"])
+    for budget, holds in ((0, "0"), (1, "1")):
+        done = invoke(MODEL, tmp_path / "a.npz", "-o", tmp_path / "out", "--truth", truth, "--no-video", "--missed-budget", budget)
+        assert done.exit_code == 0
+        judged = rows_of(tmp_path / "out")[3]
+        assert (judged["missed"], judged["assumptions_hold"]) == ("1", holds)
+        assert judged["truth_inside"] == "1" or budget == 0
+        summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+        assert summary["missed_budget"] == budget
+        assert (summary["assumptions"][-1] == "In place of these 0 pixels: at most 1.") == (budget == 1)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
