@@ -2,9 +2,10 @@
 
     python scripts/derive_field.py [--scene models/paper.toml] [--flights 1] [--share 0.95] [-o models/field.toml]
 
-The box is as wide as the frame leaves room for: a marking may lie wherever lit pixels reach, and a pixel more on either side of a
-marking costs about 0.04 rad of pitch and 0.08 m of altitude, since a runway of 27 px either side of its middle and 35 rows tells no more.
-So the markings should be where the pixels fire, and line_px no larger than it must be.
+The box is as wide as the frame leaves room for: a marking may lie wherever lit pixels reach. The paper's runway is 27 px either side of its
+middle and 35 rows long, and pitch and altitude compensate each other: lines of one pixel give half-widths of 0.015 rad and 0.027 m, while
+three quarters of a pixel more on either side of every marking make 0.05 rad and 0.1 m of them, and a line_px of 1 the whole domain. So the
+markings should be where the pixels fire, and line_px no larger than it must be.
 
 1. Markings. A stripe of some width fires along its edges, while its middle, once it is lit all the time, stays dark. Each stripe becomes
    two markings, at a distance from its middle for which they miss the fewest pixels; the ends, in whose last pixel little changes, are
