@@ -180,6 +180,31 @@ def test_an_unusable_recording_is_an_error_of_one_line_and_nothing_is_written(tm
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("suffix", [".raw", ".dat", ".es", ".aedat4", ".csv", ".npz", ".h5", ".hdf5"])
+@pytest.mark.parametrize("content", [b"", b"\0" * 5000, b"GIF89a" * 99], ids=["empty", "zeros", "foreign"])
+def test_no_kind_of_recording_that_is_unusable_gets_past_one_line(tmp_path, suffix, content):
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(content)
+    done = invoke(MODEL, path, "-o", tmp_path / "out")
+    assert done.exit_code == 2
+    assert done.stderr.startswith(f"{path}: ")
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("suffix", "version"), [(".raw", "evt2"), (".raw", "evt3"), (".dat", "dat2"), (".es", None), (".aedat4", None)])
+def test_a_recording_without_an_event_is_refused(tmp_path, suffix, version):
+    faery = pytest.importorskip("faery", reason="the extra 'recordings' is not installed")
+    path = tmp_path / f"a{suffix}"
+    none = np.empty(0, dtype=faery.EVENTS_DTYPE)
+    faery.events_stream_from_array(none, dimensions=(640, 480)).to_file(path, version=version, zero_t0=False)
+    done = invoke(MODEL, path, "-o", tmp_path / "out")
+    assert done.exit_code == 2
+    assert "no event in it" in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
 def test_of_a_damaged_recording_what_was_good_is_estimated(events, tmp_path):
     good = events[events["t"] < 400_000]
     lines = [f"{t},{x},{y},{p}" for t, x, y, p in good.tolist()]
