@@ -67,7 +67,7 @@ def run_model(
         known = None if truth is None else Truth.load(truth)
         packets = _nonempty(recording, read_events(recording, estimator.scene.camera.shape))
         folder = output or Path("out") / recording.stem
-        report = Report(folder, estimator, stream.window_us, stream.step_us, known, video=video)
+        report = Report(folder, estimator, stream.window_us, stream.step_us, known, video=video, missed_budget=missed_budget)
     except (ModelError, EventError, RecordingError, TruthError, OSError) as error:
         fail(error)
     fault, code = None, 0

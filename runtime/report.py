@@ -92,13 +92,13 @@ def missed_pixels(scene: Scene, frame: NDArray[np.uint8], state: NDArray[np.floa
     return int(np.count_nonzero((runway_image(scene, state) != 0) & ~dilated(frame != 0, line_px)))
 
 
-def judge(scene: Scene, frame: NDArray[np.uint8], estimate: Estimate, truth: NDArray[np.float64]) -> Judgement:
-    """The window's frame and estimate against its true state (4,)."""
+def judge(scene: Scene, frame: NDArray[np.uint8], estimate: Estimate, truth: NDArray[np.float64], missed_budget: int) -> Judgement:
+    """The window's frame and estimate, made with that budget, against its true state (4,)."""
     missed = missed_pixels(scene, frame, truth, scene.tolerance.line_px)
     in_domain = bool(((scene.domain.lower <= truth) & (truth <= scene.domain.upper)).all())
     error = None if estimate.state is None else float(np.linalg.norm(estimate.state - truth))
     inside = estimate.box is not None and estimate.box.contains(truth)
-    return Judgement(truth, missed, in_domain and missed <= scene.tolerance.missed_budget, inside, error)
+    return Judgement(truth, missed, in_domain and missed <= missed_budget, inside, error)
 
 
 @dataclass
@@ -151,11 +151,25 @@ class Tally:
 
 
 class Report:
-    """Takes windows with `add` and writes the files above; `close` finishes them. Raises OSError where a file cannot be written."""
+    """Takes windows with `add` and writes the files above; `close` finishes them. Raises OSError where a file cannot be written.
 
-    def __init__(self, folder: Path, estimator: Estimator, window_us: int, step_us: int, truth: Truth | None, *, video: bool) -> None:
+    `missed_budget`: the one that the estimator was loaded with, None for the model's.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        estimator: Estimator,
+        window_us: int,
+        step_us: int,
+        truth: Truth | None,
+        *,
+        video: bool,
+        missed_budget: int | None = None,
+    ) -> None:
         self.folder, self.estimator, self.window_us, self.truth, self.video = folder, estimator, window_us, truth, video
         self.step_us = step_us
+        self.missed_budget = estimator.scene.tolerance.missed_budget if missed_budget is None else missed_budget
         self.tally = Tally()
         folder.mkdir(parents=True, exist_ok=True)
         self._csv_part = folder / "estimates.csv.part"
@@ -172,7 +186,7 @@ class Report:
         """One window: its start, its frame, what the estimator made of it, and how long that took."""
         number = self.tally.counts["windows"]
         state = self.truth.at(start_us + self.window_us / 2) if self.truth else None
-        judgement = None if state is None else judge(self.estimator.scene, frame, estimate, state)
+        judgement = None if state is None else judge(self.estimator.scene, frame, estimate, state, self.missed_budget)
         self.tally.add(estimate, milliseconds, judgement)
         row = _row(start_us, estimate, float(frame.mean()), milliseconds)
         self._rows.writerow([*row, *(_judgement_row(judgement) if self.truth else [])])
@@ -219,9 +233,17 @@ class Report:
         pictures["state.png"] = draw_history(self.estimator.scene, self._history)
         for name, picture in pictures.items():
             _write_whole(self.folder / name, cv2.imencode(".png", picture)[1].tobytes())
-        summary = {**extra, **self.tally.table(), "assumptions": self.estimator.metadata["assumptions"]}
+        budget = {"missed_budget": self.missed_budget, "assumptions": self._assumptions()}
+        summary = {**extra, **self.tally.table(), **budget}
         _write_whole(self.folder / "summary.json", json.dumps(summary, indent=2).encode())
         return summary
+
+    def _assumptions(self) -> list[str]:
+        """The model's, and what the caller put in place of its budget."""
+        own = self.estimator.scene.tolerance.missed_budget
+        if self.missed_budget == own:
+            return self.estimator.metadata["assumptions"]
+        return [*self.estimator.metadata["assumptions"], f"In place of these {own} pixels: at most {self.missed_budget}."]
 
 
 def _row(start_us: int, estimate: Estimate, lit_share: float, milliseconds: float) -> list[object]:

@@ -52,6 +52,8 @@ SUBDIVISIONS = 8
 MOST_TRIES = 100
 HISTORY_WIDTH = 640
 """Narrow, so that its texts can be read on a telephone."""
+LINE_PX = 4
+"""Lines on the picture of the standard Hough's, seen on a telephone too."""
 CLOSE_UP = (160, 213)
 """Rows and columns around the runway that a filter's picture shows, magnified three times."""
 UNSAFE, USER_ERROR = 1, 2
@@ -248,7 +250,7 @@ def hough_picture(scene: Scene, test: Test) -> tuple[Picture, int, int]:
     picture = colour_pixels(test.frame, np.zeros_like(test.frame), None).repeat(2, axis=0).repeat(2, axis=1)
     for segment, matches in zip(segments * 2, right, strict=True):
         if matches:
-            cv2.line(picture, *_whole(segment), FILTERED, 2, cv2.LINE_AA)
+            cv2.line(picture, *_whole(segment), FILTERED, LINE_PX, cv2.LINE_AA)
         else:
             _dashed(picture, segment, (80, 80, 255))
     if test.estimate.state is not None:
@@ -263,10 +265,10 @@ def _whole(segment: NDArray[np.float64]) -> tuple[tuple[int, int], tuple[int, in
 
 
 def _dashed(picture: Picture, segment: NDArray[np.float64], colour: tuple[int, int, int]) -> None:
-    dashes = max(2, int(np.linalg.norm(segment[1] - segment[0]) / 7))
+    dashes = max(3, int(np.linalg.norm(segment[1] - segment[0]) / (3 * LINE_PX)))
     for dash in range(0, dashes, 2):
         part = segment[0] + np.outer([dash / dashes, (dash + 1) / dashes], segment[1] - segment[0])
-        cv2.line(picture, *_whole(part), colour, 2, cv2.LINE_AA)
+        cv2.line(picture, *_whole(part), colour, LINE_PX, cv2.LINE_AA)
 
 
 # --- the page ---
@@ -284,7 +286,9 @@ p.note, figcaption { color: var(--quiet); font-size: .9rem; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .85rem; width: 100%; }
 th, td { padding: .3rem .5rem; text-align: right; border-bottom: 1px solid var(--line); }
 th:first-child, td:first-child { text-align: left; } tr:nth-child(even) td { background: var(--stripe); }
+table.tight { font-size: .8rem; } table.tight th, table.tight td { white-space: nowrap; }
 img { display: block; width: 100%; height: auto; border-radius: 4px; }
+figure.narrow { max-width: 44rem; margin-inline: auto; }
 figure { margin: 1rem 0; } figure > figcaption { margin-top: .4rem; }
 .filters { display: grid; grid-template-columns: repeat(auto-fit, minmax(160px, 1fr)); gap: .7rem; }
 .filters.wide { grid-template-columns: repeat(auto-fit, minmax(300px, 1fr)); margin-bottom: .7rem; }
@@ -308,15 +312,17 @@ class Page:
         """A paragraph."""
         self._parts.append(f'<p class="{kind}">{html.escape(text)}</p>')
 
-    def table(self, headings: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-        """A table that scrolls by itself where the page is narrow."""
+    def table(self, headings: Sequence[str], rows: Iterable[Sequence[object]], kind: str = "") -> None:
+        """A table that scrolls by itself where the page is narrow; one of kind "tight" keeps every row on one line."""
         head = "".join(f"<th>{html.escape(heading)}</th>" for heading in headings)
         body = "".join("<tr>" + "".join(f"<td>{html.escape(str(value))}</td>" for value in row) + "</tr>" for row in rows)
-        self._parts.append(f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>')
+        self._parts.append(
+            f'<div class="scroll" tabindex="0"><table class="{kind}"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+        )
 
-    def figure(self, name: str, picture: Picture, caption: str) -> None:
-        """A picture as wide as the page."""
-        self._parts.append(self._figure(name, picture, caption, ""))
+    def figure(self, name: str, picture: Picture, caption: str, kind: str = "") -> None:
+        """A picture as wide as the page, or one of kind "narrow"."""
+        self._parts.append(self._figure(name, picture, caption, kind))
 
     def figures(self, figures: Iterable[tuple[str, Picture, str, bool]], kind: str = "") -> None:
         """Pictures beside each other; those marked True are framed in green."""
@@ -349,7 +355,7 @@ def add_cells(page: Page, scene: Scene, rows: Sequence[CellRow]) -> None:
     )
     names = [marking.name for marking in scene.runway.markings]
     headings = ["cell", "θ, y, z", "S, pixels", *(f"{kind} {name}" for name in names for kind in ("ρ px", "φ °")), "entries", "seconds"]
-    page.table(headings, [_cell_texts(row) for row in rows])
+    page.table(headings, [_cell_texts(row) for row in rows], "tight")
 
 
 def _cell_texts(row: CellRow) -> list[object]:
@@ -380,7 +386,7 @@ def add_frames(page: Page, scene: Scene, flight: Flight) -> None:
     )
     page.text("Errors are 2-norms of (θ, x, y, z), rad and m together, as in the paper.", "note")
     caption = "State against time: certified band (amber), estimate (magenta), truth (white)."
-    page.figure("state", draw_history(scene, flight.history, HISTORY_WIDTH), caption)
+    page.figure("state", draw_history(scene, flight.history, HISTORY_WIDTH), caption, "narrow")
 
 
 def add_test(page: Page, estimator: Estimator, test: Test) -> None:
@@ -435,7 +441,10 @@ def add_runs(page: Page, runs: Sequence[dict[str, Any]]) -> None:
     page.text(
         "Lines thicker than a pixel, pixels that fail to fire, vibration. Theorem A promises the truth inside where its assumptions hold."
     )
-    page.table(["", *(Path(run["model"]).stem for run in runs)], run_rows(runs))
+    names = [Path(run["model"]).stem for run in runs]
+    page.table(["", *names], run_rows(runs))
+    for name, run in zip(names, runs, strict=True):
+        page.text(f"{name} assumes: {' '.join(run['assumptions'])}", "note")
 
 
 def run_rows(runs: Sequence[dict[str, Any]]) -> list[list[object]]:
@@ -478,7 +487,7 @@ def reproduce(model: Path | None, frames: int, runs: Sequence[Path], out: Path, 
     add_hough(page, scene, tests[0], flight)
     if summaries:
         add_runs(page, summaries)
-    page.heading("Every certificate here assumes")
+    page.heading(f"Every certificate of the {len(flight.inside)} frames assumes")
     for line in estimator.metadata["assumptions"]:
         page.text(line)
     page.write("The paper's experiment, reproduced")

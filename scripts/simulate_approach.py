@@ -2,9 +2,10 @@
 
     python scripts/simulate_approach.py [--scene SCENE.toml] [--start 0] [--seconds 52.8] [--seed N] [--out out/simulated]
 
-The target: flat textured ground with a stripe of real width around every marking of the scene. A pixel sees the mean reflectance of
+The target: flat textured ground with a stripe of real width around every marking of the scene (give one whose markings are stripes'
+middles, as models/paper.toml; models/field.toml models their edges). A pixel sees the mean reflectance of
 its footprint: exact for the stripes' edges up to the footprint's tilt, one bilinear sample for the texture. The camera follows the
-descent of `fly_approach` and vibrates in yaw, roll and pitch, which is what makes a slow camera's edges fire.
+descent of `fly_approach` and vibrates in yaw, roll and pitch with the propeller, which is what makes a slow camera's edges fire.
 
 The sensor: each pixel fires when the log of its light has moved by its own contrast threshold from the level at its last event, then
 stays blind for the refractory time and takes the level found at its end. Some pixels are dead, all others fire noise at a Poisson
@@ -67,7 +68,8 @@ Levels = NDArray[np.floating]
 class Target:
     """Stripes and ground. Reflectances are shares of the stripes'; the texture's spread is that of the log."""
 
-    stripe_width_m: float = 0.008
+    stripe_width_m: float = 0.004
+    """To the stripes' distance of 0.2 m what ICAO Annex 14 (5.2.7) asks of a side stripe, 0.9 m, is to a runway of 45 m."""
     ground_reflectance: float = 0.2
     texture_spread: float = 0.05
     patch_share: float = 0.006
@@ -77,7 +79,11 @@ class Target:
 
 @dataclass(frozen=True)
 class Sensor:
-    """What a pixel of the event camera does. Thresholds are differences of the natural log of light."""
+    """What a pixel of the event camera does. Thresholds are differences of the natural log of light.
+
+    The values are those usual for this kind of sensor: Gallego et al., "Event-based Vision: A Survey" (2020), give thresholds of 10 to
+    50 %; Hu et al., "v2e" (2021), simulate a spread of 0.03 to 0.05 and noise of 0.1 to some Hz a pixel.
+    """
 
     contrast_threshold: float = 0.25
     threshold_spread: float = 0.04
@@ -91,16 +97,20 @@ class Sensor:
 
 @dataclass(frozen=True)
 class Vibration:
-    """Largest angles of the airframe's vibration, rad, plus or minus: two tones an axis, 7 to 3, which swell and calm down."""
+    """Largest angles of the airframe's vibration, rad, plus or minus: two tones an axis, 7 to 3, which swell and calm down.
 
-    yaw_rad: float = 0.0011
-    roll_rad: float = 0.0005
-    pitch_rad: float = 0.0004
-    calmest: float = 0.35
+    A propeller shakes the airframe at its rotation's frequency and at multiples of it: with two blades and 2400 rpm, 40 and 80 Hz. Both
+    periods are shorter than a window, so that an edge sweeps all of its range in each.
+    """
+
+    yaw_rad: float = 0.0014
+    roll_rad: float = 0.0007
+    pitch_rad: float = 0.0006
+    calmest: float = 0.75
     """Smallest amplitude, as a share of the largest."""
     swell_s: float = 6.1
     """Time from one calm to the next."""
-    tones_hz: tuple[tuple[float, float], ...] = ((31.0, 23.0), (27.0, 41.0), (37.0, 19.0))
+    tones_hz: tuple[tuple[float, float], ...] = ((40.0, 80.0),) * 3
 
     def angles(self, time_us: Floats, phases_rad: Floats) -> Floats:
         """Yaw, roll and pitch at the given times (n,): (n, 3). `phases_rad`: (3, 2)."""

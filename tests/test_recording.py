@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from runtime.frames import FrameStream
-from runtime.recording import EVENT, PACKET_EVENTS, RecordingError, read_events, sensor_shape
+from runtime.recording import EVENT, FAERY_SUFFIXES, HDF5_SUFFIXES, PACKET_EVENTS, RecordingError, read_events, sensor_shape
 
 SHAPE = (10, 20)
 RECORDINGS = Path(os.environ.get("GLIDEPROOF_RECORDINGS", Path(__file__).resolve().parents[2] / "shared" / "recordings"))
@@ -148,6 +148,71 @@ def test_an_unreadable_file_is_an_error_of_one_line_that_names_it(tmp_path, name
         read(tmp_path / name, SHAPE)
     assert str(caught.value).startswith(str(tmp_path / name))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("suffix", [*FAERY_SUFFIXES, ".csv", ".npz", *HDF5_SUFFIXES])
+@pytest.mark.parametrize(
+    "content", [b"", b"\0", b"\0" * 70_000, b"GIF89a" + bytes(range(256)) * 40, b"% format of something else\n" * 9], ids=len
+)
+def test_no_reader_takes_an_empty_a_zero_or_a_foreign_file(tmp_path, suffix, content):
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(content)
+    with pytest.raises(RecordingError) as caught:
+        read(path, SHAPE)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+    if not content:
+        assert "the file is empty" in str(caught.value)
+
+
+def saved(path: Path, events: NDArray) -> Path:
+    """The events written in the kind that the path's suffix names."""
+    columns = {name: events[name] for name in EVENT.names}
+    if path.suffix == ".npz":
+        np.savez_compressed(path, **columns)
+    elif path.suffix in HDF5_SUFFIXES:
+        h5py = pytest.importorskip("h5py", reason="the extra 'recordings' is not installed")
+        with h5py.File(path, "w") as file:
+            for name, column in columns.items():
+                file.create_dataset(name, data=column)
+    elif path.suffix == ".csv":
+        np.savetxt(path, events, fmt="%d", delimiter=",", header="t,x,y,p", comments="")
+    else:
+        written_by_faery(path, events, {".raw": "evt3", ".dat": "dat2"}.get(path.suffix))
+    return path
+
+
+@pytest.mark.parametrize("suffix", [*FAERY_SUFFIXES, ".csv", ".npz", *HDF5_SUFFIXES])
+def test_of_a_file_cut_anywhere_only_its_first_events_are_read(tmp_path, suffix):
+    events = random_events(500)
+    path = saved(tmp_path / f"a{suffix}", events)
+    whole, content = read(path, SHAPE), path.read_bytes()
+    np.testing.assert_array_equal(np.sort(whole, order=EVENT.names), np.sort(events, order=EVENT.names))
+    for share in (0.01, 0.2, 0.5, 0.9, 0.999):
+        path.write_bytes(content[: int(share * len(content))])
+        try:
+            back, message = read_until_a_fault(path)
+        except RecordingError as error:
+            back, message = np.empty(0, dtype=EVENT), str(error)
+        np.testing.assert_array_equal(back, whole[: len(back)])
+        # An AEDAT4 file ends with an index, which holds no event.
+        assert len(back) < len(whole) or (suffix, share) == (".aedat4", 0.999)
+        if len(back) == 0:
+            assert message.startswith(f"{path}: ")
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npz", *HDF5_SUFFIXES])
+def test_repeated_and_unsorted_times_and_events_outside_are_counted_by_the_stream(tmp_path, suffix):
+    events = random_events(400)
+    events["t"][100:120] = events["t"][100]
+    events["t"][[200, 300]] = events["t"][[300, 200]]
+    events["x"][50], events["y"][60] = 20, -1
+    stream = FrameStream(SHAPE, 10_000)
+    frames = list(stream.frames(read_events(saved(tmp_path / f"a{suffix}", events), SHAPE)))
+    latest = np.maximum.accumulate(np.delete(events["t"], [50, 60]))
+    assert stream.unsorted_events == np.count_nonzero(np.delete(events["t"], [50, 60])[1:] < latest[:-1]) > 0
+    assert stream.outside_events == 2
+    assert len(frames) == (events["t"].max() - events["t"][0]) // 10_000 + 1
 
 
 @pytest.mark.parametrize(

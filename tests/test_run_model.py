@@ -124,6 +124,23 @@ def test_windows_may_overlap_and_the_budget_be_changed(recording, tmp_path):
     assert [int(row["time_us"]) for row in rows_of(tmp_path)] == [20_000 * number for number in range(2 * WINDOWS)]
 
 
+def test_windows_are_judged_by_the_budget_that_was_given(events, truth, estimator, tmp_path):
+    image = runway_image(estimator.scene, STATES[3]) != 0
+    row, column = np.argwhere(image)[20]
+    dead = (events["y"] == row) & (events["x"] == column)
+    changed = events[~(dead & (events["t"] >= 120_000) & (events["t"] < 160_000))]
+    np.savez(tmp_path / "a.npz", t=changed["t"], x=changed["x"], y=changed["y"], p=changed["p"])
+    for budget, holds in ((0, "0"), (1, "1")):
+        done = invoke(MODEL, tmp_path / "a.npz", "-o", tmp_path / "out", "--truth", truth, "--no-video", "--missed-budget", budget)
+        assert done.exit_code == 0
+        judged = rows_of(tmp_path / "out")[3]
+        assert (judged["missed"], judged["assumptions_hold"]) == ("1", holds)
+        assert judged["truth_inside"] == "1" or budget == 0
+        summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+        assert summary["missed_budget"] == budget
+        assert (summary["assumptions"][-1] == "In place of these 0 pixels: at most 1.") == (budget == 1)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -159,6 +176,31 @@ def test_an_unusable_recording_is_an_error_of_one_line_and_nothing_is_written(tm
     done = invoke(MODEL, tmp_path / name, "-o", tmp_path / "out")
     assert done.exit_code == 2
     assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("suffix", [".raw", ".dat", ".es", ".aedat4", ".csv", ".npz", ".h5", ".hdf5"])
+@pytest.mark.parametrize("content", [b"", b"\0" * 5000, b"GIF89a" * 99], ids=["empty", "zeros", "foreign"])
+def test_no_kind_of_recording_that_is_unusable_gets_past_one_line(tmp_path, suffix, content):
+    path = tmp_path / f"a{suffix}"
+    path.write_bytes(content)
+    done = invoke(MODEL, path, "-o", tmp_path / "out")
+    assert done.exit_code == 2
+    assert done.stderr.startswith(f"{path}: ")
+    assert done.stderr.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("suffix", "version"), [(".raw", "evt2"), (".raw", "evt3"), (".dat", "dat2"), (".es", None), (".aedat4", None)])
+def test_a_recording_without_an_event_is_refused(tmp_path, suffix, version):
+    faery = pytest.importorskip("faery", reason="the extra 'recordings' is not installed")
+    path = tmp_path / f"a{suffix}"
+    none = np.empty(0, dtype=faery.EVENTS_DTYPE)
+    faery.events_stream_from_array(none, dimensions=(640, 480)).to_file(path, version=version, zero_t0=False)
+    done = invoke(MODEL, path, "-o", tmp_path / "out")
+    assert done.exit_code == 2
+    assert "no event in it" in done.stderr
     assert done.stderr.count("\n") == 1
     assert not (tmp_path / "out").exists()
 

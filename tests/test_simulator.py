@@ -21,9 +21,10 @@ from build_model.calibration import check_calibration
 from build_model.pixel_mask import Window
 from runtime.camera import project
 from runtime.frames import FrameStream
+from runtime.image import dilated, runway_image
 from runtime.recording import read_events
 from runtime.report import missed_pixels
-from runtime.scene import Calibration, Scene, Tolerance
+from runtime.scene import Calibration, Domain, Scene, Tolerance
 
 STEADY = simulator.Vibration(yaw_rad=0.0, roll_rad=0.0, pitch_rad=0.0)
 EXACT_TIMES = simulator.Sensor(noise_rate_hz=0.0, latency_us=0.0, latency_jitter_us=0.0)
@@ -53,7 +54,7 @@ def test_the_vibrations_calibration_bounds_every_shift_of_the_markings_and_is_ne
     homogeneous = np.concatenate([points, np.ones((*points.shape[:-1], 1))], axis=-1).swapaxes(1, 2)
     seen = np.linalg.solve(shaken.views(times).to_ground, steady.views(times).to_ground @ homogeneous)
     shift = np.abs((seen[:, :2] / seen[:, 2:]).swapaxes(1, 2) - points)
-    scene = replace(paper_scene, calibration=vibration.calibration(FOCAL_PX), tolerance=Tolerance(line_px=1))
+    scene = replace(paper_scene, calibration=vibration.calibration(FOCAL_PX), tolerance=Tolerance(line_px=2))
     first, last = np.floor(points.min(axis=(0, 1))).astype(int), np.ceil(points.max(axis=(0, 1))).astype(int)
     bound = check_calibration(scene, Window(first[1], last[1], first[0], last[0]))
     assert shift.max() <= bound
@@ -65,7 +66,7 @@ def test_a_pixel_on_a_stripe_receives_the_stripes_light_and_one_beside_it_the_gr
     ground = simulator.Ground(paper_scene, target, np.random.default_rng(0))
     flight = flight_of(paper_scene, STEADY)
     start = np.zeros(1)
-    middles = project(paper_scene, flight.states(start))[0].mean(axis=1)
+    middles = np.asarray(project(paper_scene, flight.states(start))[0].mean(axis=1), dtype=np.float64)
     light = ground.log_light(middles[:, 0], middles[:, 1], flight.views(start))
     np.testing.assert_allclose(light, 0, atol=1e-4)
     beside = ground.log_light(middles[:, 0] + 10, middles[:, 1], flight.views(start))
@@ -77,9 +78,9 @@ def test_a_row_across_a_stripe_receives_the_stripes_whole_width(paper_scene):
     ground = simulator.Ground(paper_scene, target, np.random.default_rng(0))
     flight = flight_of(paper_scene, STEADY)
     view = flight.views(np.zeros(1))
-    row = np.floor(project(paper_scene, flight.states(np.zeros(1)))[0, 0, :, 1].mean()) + 0.5
-    columns = np.arange(640) + 0.5
-    light = np.exp(ground.log_light(columns, np.full(640, row), view)[0])
+    row = float(np.floor(project(paper_scene, flight.states(np.zeros(1)))[0, 0, :, 1].mean())) + 0.5
+    columns = np.arange(640, dtype=np.float64) + 0.5
+    light = np.exp(ground.log_light(columns, np.full(640, row, dtype=np.float64), view)[0])
     covered = ((light - target.ground_reflectance) / (1 - target.ground_reflectance)).sum()
     fall = view.to_ground[0, 2] @ [320, row, 1]
     assert covered == pytest.approx(2 * target.stripe_width_m * FOCAL_PX * fall / view.altitude_m[0], rel=1e-3)
@@ -108,11 +109,13 @@ def test_a_pixel_fires_as_one_that_is_sampled_all_the_time(paper_scene):
     twin = simulator.event_camera(paper_scene, 20.0, 0.4, 3, sensor=EXACT_TIMES)
     events = np.concatenate(list(camera.blocks()))
     pixels = events["y"].astype(int) * 640 + events["x"]
-    # Nearer than row 100 a pixel's footprint is below the texture's grain.
-    near = np.unique(pixels[pixels >= 100 * 640])
+    # Where footprints exceed the texture's grain the choice of pixels to sample may leave some out.
+    view = camera.flight.views(np.zeros(1))
+    fall = view.to_ground[0, 2, 1] * camera._v + view.to_ground[0, 2, 2]
+    sharp = np.flatnonzero(view.altitude_m[0] / (FOCAL_PX * np.maximum(fall, 0.01) ** 2) < simulator.TEXTURE_GRAIN_M)
     drawn = np.random.default_rng(0)
     quiet = np.setdiff1d(np.flatnonzero(twin._alive), pixels)
-    chosen = [*drawn.choice(near, 60, replace=False), *drawn.choice(quiet[quiet >= 100 * 640], 30)]
+    chosen = [*drawn.choice(np.intersect1d(pixels, sharp), 60, replace=False), *drawn.choice(np.intersect1d(quiet, sharp), 30)]
     for pixel in chosen:
         own = events[pixels == pixel]
         expected = events_of_pixel(twin, int(pixel), camera.flight.duration_us)
@@ -146,17 +149,17 @@ def test_noise_comes_at_its_rate_and_never_from_dead_pixels(paper_scene):
     assert camera._alive[events["y"].astype(int) * 640 + events["x"]].all()
 
 
-def test_lines_are_thicker_than_a_pixel_so_that_a_tolerance_of_one_pixel_is_needed_and_is_enough(paper_scene):
+def test_lines_are_thicker_than_a_pixel_and_some_of_their_pixels_fail_to_fire(paper_scene):
     camera = simulator.event_camera(paper_scene, 22.0, 1.0, 6)
-    stream = FrameStream(paper_scene.camera.shape, simulator.WINDOW_US)
-    frames = list(stream.frames(camera.blocks()))
+    frames = list(FrameStream(paper_scene.camera.shape, simulator.WINDOW_US).frames(camera.blocks()))
     starts, states = simulator.window_truths(camera.flight, frames[0][0])
     assert [start for start, _ in frames] == starts.tolist()
-    missed = np.array(
-        [[missed_pixels(paper_scene, frame, state, t) for t in (0, 1)] for (_, frame), state in zip(frames, states, strict=True)]
-    )
-    assert np.median(missed[:, 0]) > 10
-    assert np.mean(missed[:, 1] <= 1) > 0.8
+    images = [runway_image(paper_scene, state) != 0 for state in states]
+    thickness = [frame[dilated(image, 3)].sum() / image.sum() for (_, frame), image in zip(frames, images, strict=True)]
+    assert 2 < np.median(thickness) < 4
+    missed = np.array([np.count_nonzero(image & (frame == 0)) for (_, frame), image in zip(frames, images, strict=True)])
+    assert np.mean(missed > 0) > 0.2
+    assert np.median(missed) < 5
     assert 0.003 < np.median([frame.mean() for _, frame in frames]) < 0.05
 
 
@@ -182,18 +185,57 @@ def test_a_part_beyond_the_approach_is_refused(paper_scene):
 # --- models/field.toml ---
 
 
-def test_the_chosen_tolerance_is_the_smallest_that_covers_the_shift_and_that_the_bank_can_bear():
-    assert derive_field.chosen_tolerance([30, 3, 0, 0], [24, 24, 24, 24], [0.9, 0.9, 0.9, 0.9]) == 1
-    assert derive_field.chosen_tolerance([0, 3, 0, 0], [24, 24, 24, 24], [0.0, 0.9, 0.9, 0.9]) == 0
-    assert derive_field.chosen_tolerance([30, 30, 2, 0], [24, 24, 24, 24], [0.9, 0.9, 0.9, 0.9]) == 2
-    assert derive_field.chosen_tolerance([30, 30, 30, 30], [24, 24, 24, 24], [0.9, 0.9, 0.9, 0.9]) is None
-    assert derive_field.chosen_tolerance([0, 0, 0, 0], [24, 24, 24, 24], [5.0, 5.0, 5.0, 5.0]) is None
-
-
-def test_field_toml_is_the_papers_scene_with_what_the_sensor_needs(paper_scene, repository: Path, tmp_path: Path):
+def test_a_budget_is_bearable_if_every_entry_has_more_pixels(repository: Path):
     field = Scene.load(repository / "models" / "field.toml")
-    assert replace(field, calibration=Calibration(), tolerance=paper_scene.tolerance) == paper_scene
-    assert field.calibration == simulator.Vibration().calibration(FOCAL_PX)
-    text = derive_field.scene_text(repository / "models" / "paper.toml", field.calibration, field.tolerance, "# how")
-    (tmp_path / "again.toml").write_text(text)
-    assert Scene.load(tmp_path / "again.toml") == field
+    axes = [replace(axis, centres=axis.centres[:1]) for axis in field.domain.axes]
+    one_cell = replace(field, domain=Domain(*axes))
+    strong, weak, hopeless = (smallest for _, smallest in derive_field.bearable(one_cell, [0, 3, 10_000]))
+    assert strong is not None
+    assert weak is not None
+    assert weak > 3
+    assert hopeless is None
+
+
+def test_a_stripe_is_two_markings_about_its_middle_or_the_middle_alone(paper_scene):
+    two, one = derive_field.field_scene(paper_scene, 0.003), derive_field.field_scene(paper_scene, 0.0)
+    np.testing.assert_allclose(two.runway.x_m, [-0.103, -0.097, 0.097, 0.103])
+    np.testing.assert_allclose(one.runway.x_m, [-0.1, 0.1])
+    np.testing.assert_allclose(two.runway.ends_z_m, np.broadcast_to([0.004, 0.296], (4, 2)))
+    assert replace(two, runway=paper_scene.runway, bank=paper_scene.bank) == paper_scene
+
+
+def test_missed_pixels_of_a_flight_are_those_counted_one_window_at_a_time(paper_scene):
+    placed = [derive_field.field_scene(paper_scene, distance) for distance in (0.0, 0.0025)]
+    missed = derive_field.missed_of_flight(paper_scene, placed, 6, 0.2, Console(quiet=True))
+    camera = simulator.event_camera(paper_scene, 0.0, 0.2, 6)
+    frames = list(FrameStream((480, 640), 40_000).frames(camera.blocks()))
+    _, states = simulator.window_truths(camera.flight, frames[0][0])
+    expected = [
+        [[missed_pixels(scene, frame, state, t) for t in derive_field.TOLERANCES_PX] for scene in placed]
+        for (_, frame), state in zip(frames, states, strict=True)
+    ]
+    np.testing.assert_array_equal(missed, expected)
+    assert missed.max() > 0
+
+
+def test_field_toml_is_the_papers_scene_with_markings_and_budget_of_its_own(paper_scene, repository: Path):
+    field = Scene.load(repository / "models" / "field.toml")
+    assert replace(field, runway=paper_scene.runway, tolerance=paper_scene.tolerance, bank=paper_scene.bank) == paper_scene
+    distances = [derive_field.field_scene(paper_scene, simulator.Target().stripe_width_m / 2 + d) for d in derive_field.BESIDE_EDGES_M]
+    assert field in [replace(scene, tolerance=field.tolerance) for scene in distances]
+
+
+def test_a_scene_is_read_as_it_was_written(paper_scene, tmp_path: Path):
+    off = Calibration(yaw_rad=1e-4, principal_px=0.25)
+    for scene in (paper_scene, replace(paper_scene, calibration=off, tolerance=Tolerance(line_px=1, missed_budget=2))):
+        (tmp_path / "again.toml").write_text(derive_field.scene_text(scene, "how\nit came about"))
+        assert Scene.load(tmp_path / "again.toml") == scene
+
+
+def test_most_windows_of_another_flight_keep_the_fields_budget(paper_scene, repository: Path):
+    field = Scene.load(repository / "models" / "field.toml")
+    camera = simulator.event_camera(paper_scene, 20.0, 0.8, 8)
+    frames = list(FrameStream((480, 640), 40_000).frames(camera.blocks()))
+    _, states = simulator.window_truths(camera.flight, frames[0][0])
+    counted = [missed_pixels(field, frame, state, field.tolerance.line_px) for (_, frame), state in zip(frames, states, strict=True)]
+    assert np.mean(np.array(counted) <= field.tolerance.missed_budget) >= 0.8
