@@ -11,33 +11,24 @@ from __future__ import annotations
 
 import enum
 import hashlib
-import stat
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime
 from numpy.typing import ArrayLike, NDArray
 
+from runtime.entries import BOX_TENSORS, MASK_TENSORS, Entries
 from runtime.image import dilated
-from runtime.model_file import LARGEST_FILE_BYTES, ModelError, ModelFile, parse_model
+from runtime.model_file import ModelError, ModelFile, packaged_model, parse_model, read_model
 from runtime.refine import STATE_MARGIN, Refiner, connected_parts, joined
 from runtime.scene import STATE_NAMES, Scene, SceneError
-from runtime.state_set import StateSet, tangent_of_row
+from runtime.session import OUTPUTS, check_interface, open_session, reason_of
+from runtime.state_set import StateSet
 
-PACKAGED_MODELS = (Path(__file__).parent / "models", Path(__file__).parents[1] / "models")
-"""Where the paper's model lies: in a wheel beside this file, in a checkout at the top."""
-LOG_FATAL_ONLY = 4
 REFINED_BEYOND_PX = 2
 """How far beyond the spatial masks the refinement looks at pixels; those farther out it takes for lit."""
-OUTPUTS = ("cell", "support", "mismatch", "passes", "cell_lower", "cell_upper", "filtered", "network_state")
-SIDES = ("lower", "upper")
-STATE_BOX_TENSORS = tuple(f"{name}_{side}" for name in STATE_NAMES for side in SIDES)
-BOX_TENSORS = ("row_cell", *STATE_BOX_TENSORS, "line_lower", "line_upper", "reference_row", "must_light_size")
-MASK_TENSORS = ("spatial_run_cell", "spatial_run_index", "spatial_run_step", "window_first", "window_stop")
-"""Initialisers that hold every entry as a box of states and of line coordinates, and every cell's spatial mask."""
 
 
 class FrameError(ValueError):
@@ -133,11 +124,11 @@ class Estimator:
         except SceneError as error:
             raise ModelError(f"{name}: the scene in its metadata is unusable ({error})") from error
         self._budgets = self._checked_budgets(name, missed_budget, extra_budget)
-        self._entries = _Entries.of(self.scene, model.tensors, name)
+        self._entries = Entries.of(self.scene, model.tensors, name)
         if self.metadata["smallest_must_light"] != model.tensors["must_light_size"].min():
             raise ModelError(f"{name}: its metadata misstate the smallest |K| of its entries; export it again with export-model")
-        self._session = self._open(model.content, name, threads)
-        _check_interface(self._session, self.scene, model.tensors["must_light_size"].shape, name)
+        self._session = open_session(model.content, name, threads)
+        check_interface(self._session, self.scene, model.tensors["must_light_size"].shape, name)
         self._domain_lower, self._domain_upper = self.scene.domain.lower, self.scene.domain.upper
         self._fixed = self._domain_lower == self._domain_upper
         window = self._entries.window_and_beyond(REFINED_BEYOND_PX)
@@ -160,8 +151,8 @@ class Estimator:
         another file is looked at. The file is checked before onnxruntime sees it (`runtime.model_file`). Raises `ModelError` for a file
         that is missing, too large, not ours, damaged or of another version, and for a budget that it cannot keep.
         """
-        source = _packaged_model() if path is None else Path(path)
-        content = _read(source)
+        source = packaged_model() if path is None else Path(path)
+        content = read_model(source)
         digest = hashlib.sha256(content).hexdigest()
         if sha256 is not None and sha256.lower() != digest:
             raise ModelError(f"{source}: sha256 is {digest}, the caller trusts {sha256}; take the file from its source again")
@@ -180,7 +171,7 @@ class Estimator:
         try:
             return dict(zip(OUTPUTS, self._session.run(OUTPUTS, {"frame": pixels, **self._budgets}), strict=True))
         except Exception as error:  # onnxruntime raises classes of its own that share only this one
-            raise ModelError(f"{self._arguments['path']}: onnxruntime cannot run it ({_reason(error)}); export it again") from error
+            raise ModelError(f"{self._arguments['path']}: onnxruntime cannot run it ({reason_of(error)}); export it again") from error
 
     def estimate(self, frame: NDArray, proposal: ArrayLike | None = None, refine: bool = True) -> Estimate:
         """State and certified box of one frame.
@@ -312,139 +303,3 @@ class Estimator:
         if not -1 <= extra < 2**31:
             raise ModelError(f"{name}: extra_budget {extra}: must be 0 or more, or -1 for not used")
         return {"missed_budget": np.array(missed, dtype=np.int32), "extra_budget": np.array(extra, dtype=np.int32)}
-
-    @staticmethod
-    def _open(content: bytes, name: str, threads: int) -> onnxruntime.InferenceSession:
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        options.inter_op_num_threads = 1
-        options.log_severity_level = LOG_FATAL_ONLY  # it warns of the budgets, and an error becomes an exception below
-        options.add_session_config_entry("session.strict_shape_type_inference", "1")  # declared shapes are then true ones
-        try:
-            # Folding constants would run operators of the file as it is loaded; on our graphs it saves nothing.
-            return onnxruntime.InferenceSession(
-                content, options, providers=["CPUExecutionProvider"], disabled_optimizers=["ConstantFolding"]
-            )
-        except Exception as error:  # onnxruntime raises classes of its own that share only this one
-            raise ModelError(f"{name}: onnxruntime {onnxruntime.__version__} cannot load it ({_reason(error)})") from error
-
-
-@dataclass(frozen=True)
-class _Entries:
-    """Every bank entry of the model as a set of states, padding included, which never passes; and the cells' spatial masks."""
-
-    all: StateSet
-    row_cell: NDArray[np.int32]
-    """The cell of each row of entries, (rows,)."""
-    run_cell: NDArray[np.int32]
-    run_index: NDArray[np.int32]
-    run_step: NDArray[np.int32]
-    """Ends of the runs of S: their cell, flat index in the window, and 1 at a start or -1 below a stop, (ends,) each."""
-    window: tuple[slice, slice]
-
-    @staticmethod
-    def of(scene: Scene, tensors: dict[str, NDArray[Any]], name: str) -> _Entries:
-        """The entries from the model's initialisers; an axis of width 0 is exact. Raises `ModelError` if they do not fit the scene."""
-        _check_tensors(scene, tensors, name)
-        boxes = (np.stack([tensors[f"{axis}_{side}"].ravel() for side in SIDES], axis=-1) for axis in STATE_NAMES)
-        states = np.stack(list(boxes)).astype(np.float64)
-        scale = np.stack([tensors["line_lower"][..., 2], tensors["line_upper"][..., 2]], axis=-1).reshape(-1, 2)
-        for axis, (low, high) in enumerate(zip(scene.domain.lower, scene.domain.upper, strict=True)):
-            states[axis] = np.clip(states[axis], low, high)
-        theta, x, y, z = states
-        sets = StateSet(theta, x, y, z, scale, tangent_of_row(scene.camera, tensors["reference_row"].ravel()))
-        window = tuple(slice(int(first), int(stop)) for first, stop in zip(tensors["window_first"], tensors["window_stop"], strict=True))
-        cell, index, step = (tensors[f"spatial_run_{part}"].copy() for part in ("cell", "index", "step"))  # not to keep the file
-        return _Entries(sets, tensors["row_cell"].copy(), cell, index, step, (window[0], window[1]))
-
-    def sets(self, passes: NDArray[np.bool_]) -> StateSet:
-        """The entries that pass; `passes` is (rows, width), a cell's entries in one row or several."""
-        return self.all[np.flatnonzero(passes)]
-
-    def window_and_beyond(self, margin_px: int) -> tuple[slice, slice]:
-        """The masks' window with a margin; a slice need not stop at the frame's border."""
-        rows, columns = (slice(max(side.start - margin_px, 0), side.stop + margin_px) for side in self.window)
-        return rows, columns
-
-    def within(self, cell: int, frame: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """The frame within the cell's spatial mask S."""
-        seen = np.zeros_like(frame)
-        crop = frame[self.window]
-        steps = np.zeros(crop.shape, dtype=np.int32)
-        own = self.run_cell == cell
-        steps.ravel()[self.run_index[own]] = self.run_step[own]  # a run's stop lies below it, and so never on another one's start
-        mask = steps.cumsum(axis=0) > 0
-        seen[self.window] = crop & mask
-        return seen
-
-
-def _check_tensors(scene: Scene, tensors: dict[str, NDArray[Any]], name: str) -> None:
-    """Types, shapes and ranges of the initialisers that the runtime reads. Raises `ModelError`."""
-    cells, rows, ends = scene.domain.cell_count, tensors["row_cell"].shape[:1], tensors["spatial_run_index"].shape[:1]
-    entries = (*rows, *tensors["must_light_size"].shape[1:2])
-    layout = {"row_cell": (np.int32, rows), "must_light_size": (np.int32, entries), "reference_row": (np.float64, entries)}
-    layout |= dict.fromkeys(STATE_BOX_TENSORS, (np.float32, entries))
-    layout |= {f"line_{side}": (np.float64, (*entries, 4)) for side in SIDES}
-    layout |= {f"window_{side}": (np.int64, (2,)) for side in ("first", "stop")}
-    layout |= {f"spatial_run_{part}": (np.int32, ends) for part in ("cell", "index", "step")}
-    for label, (dtype, shape) in layout.items():
-        found = tensors[label]
-        if found.dtype != dtype or found.shape != shape or found.size == 0:
-            expected = f"{np.dtype(dtype)} {list(shape)}"
-            raise ModelError(f"{name}: {label} is {found.dtype} {list(found.shape)}, its scene asks for {expected}; export it again")
-        if not np.isfinite(found).all():
-            raise ModelError(f"{name}: {label} holds values that are not finite; export it again with export-model")
-    if rows[0] < cells or not np.array_equal(np.unique(tensors["row_cell"]), np.arange(cells)):
-        raise ModelError(f"{name}: row_cell does not give rows to every one of {cells} cells; export it again with export-model")
-    first, stop = tensors["window_first"], tensors["window_stop"]
-    inside = bool(((first >= 0) & (first < stop) & (stop <= scene.camera.shape)).all())
-    limits = {"cell": (0, cells - 1), "index": (0, int(np.prod(stop - first)) - 1 if inside else -1), "step": (-1, 1)}
-    for part, (low, high) in limits.items():
-        inside &= bool(((tensors[f"spatial_run_{part}"] >= low) & (tensors[f"spatial_run_{part}"] <= high)).all())
-    if not inside:
-        raise ModelError(f"{name}: its window or its spatial masks lie outside the frame; export it again with export-model")
-
-
-def _check_interface(session: onnxruntime.InferenceSession, scene: Scene, entries: tuple[int, ...], name: str) -> None:
-    """Inputs and outputs are those of models/README.md, for the scene's frame and cells. Raises `ModelError`."""
-    cells, frame = scene.domain.cell_count, list(scene.camera.shape)
-    shapes = {"cell": [], "support": [cells], "mismatch": [cells], "passes": list(entries), "filtered": frame, "network_state": [4]}
-    shapes |= {"cell_lower": [cells, 4], "cell_upper": [cells, 4]}
-    types = {"cell": "int64", "support": "int32", "mismatch": "int32", "passes": "bool", "filtered": "uint8"}
-    expected = {
-        "inputs": [("frame", "tensor(uint8)", frame)],
-        "budgets": [(budget, "tensor(int32)", []) for budget in ("extra_budget", "missed_budget")],
-        "outputs": [(output, f"tensor({types.get(output, 'float')})", shapes[output]) for output in sorted(OUTPUTS)],
-    }
-    for kind, values in zip(expected, (session.get_inputs(), session.get_overridable_initializers(), session.get_outputs()), strict=True):
-        found = sorted((value.name, value.type, value.shape) for value in values)
-        if found != expected[kind]:
-            raise ModelError(f"{name}: its {kind} are {found!s:.200}, its scene asks for {expected[kind]}; export it again")
-
-
-def _reason(error: Exception) -> str:
-    """An error of onnxruntime's on one line."""
-    return " ".join(str(error).split())[:200]
-
-
-def _read(path: Path) -> bytes:
-    """The file's bytes. Raises `ModelError` if it cannot be read, is none, or is too large to be a model."""
-    try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode) or status.st_size > LARGEST_FILE_BYTES:
-            limit = f"files of up to {LARGEST_FILE_BYTES >> 20} MiB are read"
-            raise ModelError(
-                f"{path}: cannot be read (not a file, or of {status.st_size} bytes); {limit}: give a model that export-model wrote"
-            )
-        return path.read_bytes()
-    except OSError as error:
-        raise ModelError(f"{path}: cannot be read ({error.strerror}); give the path of a model that export-model wrote") from error
-    except ValueError as error:  # a null character in the path
-        raise ModelError(f"{str(path)!r}: cannot be read ({error}); give the path of a model that export-model wrote") from error
-
-
-def _packaged_model() -> Path:
-    for folder in PACKAGED_MODELS:
-        if (folder / "paper.onnx").is_file():
-            return folder / "paper.onnx"
-    raise ModelError("paper.onnx: comes with the package but is missing; give the path of a model, or reinstall glideproof")

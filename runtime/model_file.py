@@ -18,13 +18,17 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import stat
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+PACKAGED_MODELS = (Path(__file__).parent / "models", Path(__file__).parents[1] / "models")
+"""Where the paper's model lies: in a wheel beside this file, in a checkout at the top."""
 FORMAT_VERSION = 1
 METADATA_KEY = "glideproof"
 
@@ -142,6 +146,30 @@ class ModelFile:
     def sha256(self) -> str:
         """Digest of the whole file, hexadecimal."""
         return hashlib.sha256(self.content).hexdigest()
+
+
+def read_model(path: Path) -> bytes:
+    """The file's bytes. Raises `ModelError` if it cannot be read, is none, or is too large to be a model."""
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode) or status.st_size > LARGEST_FILE_BYTES:
+            limit = f"files of up to {LARGEST_FILE_BYTES >> 20} MiB are read"
+            raise ModelError(
+                f"{path}: cannot be read (not a file, or of {status.st_size} bytes); {limit}: give a model that export-model wrote"
+            )
+        return path.read_bytes()
+    except OSError as error:
+        raise ModelError(f"{path}: cannot be read ({error.strerror}); give the path of a model that export-model wrote") from error
+    except ValueError as error:  # a null character in the path
+        raise ModelError(f"{str(path)!r}: cannot be read ({error}); give the path of a model that export-model wrote") from error
+
+
+def packaged_model() -> Path:
+    """The paper's model that comes with the package. Raises `ModelError` if it is missing."""
+    for folder in PACKAGED_MODELS:
+        if (folder / "paper.onnx").is_file():
+            return folder / "paper.onnx"
+    raise ModelError("paper.onnx: comes with the package but is missing; give the path of a model, or reinstall glideproof")
 
 
 def parse_model(content: bytes, name: str, wanted: Sequence[str] = ()) -> ModelFile:

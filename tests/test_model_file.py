@@ -17,7 +17,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 
-from runtime.estimator import BOX_TENSORS, Estimator
+from runtime.entries import BOX_TENSORS
+from runtime.estimator import Estimator
 from runtime.model_file import (
     FORMAT_VERSION,
     LARGEST_FIELDS,
