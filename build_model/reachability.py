@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
@@ -38,6 +39,9 @@ TRIGONOMETRIC_ERROR = 2.0**-50
 
 NORM_INFLATION = 1 + 2.0**-40
 """Factor on norms of small matrices, far above the rounding of their evaluation and of the products within."""
+
+KEPT_BITS = 24
+"""Bits that are kept of a bound that LAPACK has a part in."""
 
 DOT_PRODUCT_ERROR = 2.0**-48
 """Error of a dot product of four terms in float64 as a share of the sum of the terms' sizes; the bound on it is 4 x 2^-53."""
@@ -563,7 +567,13 @@ def _inverse_lipschitz_per_px(scene: Scene, lower: Floats, upper: Floats) -> lis
     deviation = np.abs(np.eye(free.sum()) - inverse @ middle) + np.abs(inverse) @ radius + rounding
     contraction = NORM_INFLATION * np.linalg.norm(deviation, 2, axis=(-2, -1)).max(axis=0)
     norms = NORM_INFLATION * np.linalg.norm(inverse, 2, axis=(-2, -1))
-    return [float(norm / (1 - e)) if e < 1 else None for norm, e in zip(norms, contraction, strict=True)]
+    return [_rounded_up(float(norm / (1 - e))) if e < 1 else None for norm, e in zip(norms, contraction, strict=True)]
+
+
+def _rounded_up(value: float) -> float:
+    """The next number of KEPT_BITS bits: LAPACK's last bits are not the same in every process, and should not be in a model's file."""
+    mantissa, exponent = math.frexp(value)
+    return math.ldexp(math.ceil(math.ldexp(mantissa, KEPT_BITS)), exponent - KEPT_BITS)
 
 
 def _pieces(lower: Floats, upper: Floats) -> Bounds:
