@@ -1,6 +1,6 @@
 """Counts how often a certificate holds: random and adversarial frames whose truth is known exactly.
 
-    python scripts/coverage.py [MODEL.onnx] [--frames N] [--recording FILE] [-o FILE.json]
+    python scripts/coverage.py [MODEL.onnx] [--frames N] [--recording FILE] [--only SCENARIO] [-o FILE.json]
     python scripts/coverage.py [the same options] --replay "SCENARIO#NUMBER"
 
 The runway's images are drawn in rational numbers by code that the build does not have (`rational_image`), the frames are those of
@@ -180,13 +180,20 @@ def report(chunks: list[Chunk], journal: Journal, output: Path) -> int:
     return len(violations)
 
 
+def scenario_named(name: str, chosen: list[Scenario]) -> Scenario:
+    """The scenario of that name."""
+    for each in chosen:
+        if each.name == name:
+            return each
+    raise typer.BadParameter(f"no scenario {name!r}; give one of: {'; '.join(each.name for each in chosen)}")
+
+
 def named(text: str, chosen: list[Scenario]) -> tuple[Scenario, int]:
     """The scenario and the number of a frame given as "SCENARIO#NUMBER"."""
     name, _, number = text.rpartition("#")
-    scenario = next((each for each in chosen if each.name == name), None)
-    if scenario is None or not number.isdecimal():
+    if not number.isdecimal():
         raise typer.BadParameter(f'found {text!r}; give "SCENARIO#NUMBER" as the report of a violation does')
-    return scenario, int(number)
+    return scenario_named(name, chosen), int(number)
 
 
 def replay(chunk: Chunk) -> int:
@@ -205,6 +212,7 @@ def main(
     output: Annotated[Path, typer.Option("-o", "--output", help="JSON file for the counts.")] = Path("out/coverage.json"),
     seed: Annotated[int, typer.Option(min=0, help="Seed of all frames.")] = 1,
     jobs: Annotated[int, typer.Option(help="Processes.")] = 2,
+    only: Annotated[list[str] | None, typer.Option(help="Scenario of the table, to run no others; may be given again.")] = None,
     replay_frame: Annotated[str | None, typer.Option("--replay", help='One frame again: "SCENARIO#NUMBER".')] = None,
 ) -> None:
     """Run every scenario, or what is left of an earlier run, and print the table."""
@@ -216,8 +224,12 @@ def main(
         scenario, number = named(replay_frame, chosen)
         path = model if scenario.model == "given" else build_model(given.scene, scenario.model, output.parent, jobs)
         sys.exit(int(replay(Chunk(scenario, str(path), None if recording is None else str(recording), seed, number, 1, "")) > 0))
+    if only:
+        chosen = [scenario_named(name, chosen) for name in dict.fromkeys(only)]
     models = {"given": model}
-    for name in track(DERIVED, "models", console=Console(stderr=True)):
+    for name in track(
+        [name for name in DERIVED if name in {scenario.model for scenario in chosen}], "models", console=Console(stderr=True)
+    ):
         models[name] = build_model(given.scene, name, output.parent, jobs)
     chunks = chunks_of(models, chosen, frames, recording, seed)
     journal = Journal(output.with_suffix(".chunks.jsonl"), chunks)

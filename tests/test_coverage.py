@@ -302,3 +302,13 @@ def test_a_wrong_model_is_found_and_its_frames_can_be_seen_again(
     assert right.exit_code == 0
     assert "1 states judged, 0 violations" in right.output
     assert run(path, "-o", tmp_path / "coverage.json", "--replay", "no such#1").exit_code == 2
+
+
+def test_scenarios_can_be_chosen(repository: Path, tmp_path: Path) -> None:
+    model, output = repository / "models" / "paper.onnx", tmp_path / "coverage.json"
+    chosen = run(model, "--frames", 2, "--only", "clutter 2%", "--only", "B: e pixels in S", "--jobs", 1, "-o", output)
+    assert chosen.exit_code == 0
+    assert set(json.loads(output.read_text())["scenarios"]) == {"clutter 2%", "B: e pixels in S"}
+    other = run(model, "--only", "clutter 3%", "-o", output)
+    assert other.exit_code == 2
+    assert "no scenario 'clutter 3%'" in " ".join(other.output.replace("│", " ").split())
