@@ -37,9 +37,11 @@ out/paper.onnx: models/paper.toml constraints.txt $(SOURCES) | $(INSTALLED)
 	$(BIN)/export-model $< -o $@
 
 evidence: out/paper.onnx
-	$(BIN)/python scripts/coverage.py $< --frames 24000 -o out/coverage.json
-	$(BIN)/python scripts/fuzz.py $< --minutes 10 -o out/fuzz
+	$(BIN)/verify-model $<
+	$(BIN)/python -m pytest -m evidence
 	$(BIN)/python -m pytest --hypothesis-profile=long
+	$(BIN)/python scripts/fuzz.py $< --minutes 10 -o out/fuzz
+	$(BIN)/python scripts/coverage.py $< --frames 24000 -o out/coverage.json
 
 clean:
 	rm -rf .venv out dist build .pytest_cache .ruff_cache .hypothesis

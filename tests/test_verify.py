@@ -55,6 +55,7 @@ SCENES = {"paper's shape": SCENE, "tolerant": TOLERANT, "free x, three markings"
 WIDTH = 5
 """Of the rows in the last scene's model."""
 Rng = np.random.Generator
+PAPER_TOML = Path(__file__).parents[1] / "models" / "paper.toml"
 
 
 @dataclass
@@ -515,6 +516,22 @@ def assert_refuted(model: Model, folder: Path, mutate: Callable[[Rng, Model, int
     assert re.search(claims, str(report.counterexample)), str(report.counterexample)
 
 
+@pytest.fixture(scope="module")
+def paper_banks() -> list[CellBank]:
+    return build_banks(Scene.load(PAPER_TOML))
+
+
+@pytest.mark.evidence
+@pytest.mark.parametrize(("mutate", "claims"), {**MATHEMATICAL, **STRUCTURAL}.items(), ids=lambda value: getattr(value, "__name__", ""))
+def test_a_wrong_paper_model_is_refuted(
+    paper_banks: list[CellBank], tmp_path: Path, mutate: Callable[[Rng, Model, int], None], claims: str
+) -> None:
+    """Every kind of mutation of the model that comes with the package, at a random place."""
+    proto = onnx.load(PAPER_TOML.with_suffix(".onnx"))
+    model = Model(Scene.load(PAPER_TOML), list(paper_banks), proto, json.loads(proto.metadata_props[0].value))
+    assert_refuted(model, tmp_path, mutate, claims, seed=4)
+
+
 def test_saving_without_a_mutation_changes_nothing(model: Model, tmp_path: Path) -> None:
     model.set_tables(assemble(model.scene, model.banks))
     assert verify_model(model.save(tmp_path / "same.onnx")).proved
@@ -660,7 +677,7 @@ def test_bounds_tend_to_what_the_states_show() -> None:
 
 
 def test_borders_are_the_runtimes() -> None:
-    for scene in (*SCENES.values(), Scene.load(Path(__file__).parents[1] / "models" / "paper.toml")):
+    for scene in (*SCENES.values(), Scene.load(PAPER_TOML)):
         for axis in scene.domain.axes:
             assert axis_borders(axis) == axis.edges.tolist()
 
