@@ -271,12 +271,13 @@ class _Reader:
         if operator not in OPERATORS or domain:
             found = f"operator {_shown(operator)}" + (f" of {_shown(domain)}" if domain else "")
             raise ModelError(f"found the {found}; a model has static, standard operators only, without control flow")
-        for attribute in _bytes(node["attribute"]):
-            self.known(attribute, ATTRIBUTE)
+        attributes = [self.known(attribute, ATTRIBUTE) for attribute in _bytes(node["attribute"])]
         inputs = [bytes(part).decode() for part in _bytes(node["input"])]
         for place in SHAPE_OPERANDS.get(operator, ()):
             if place < len(inputs) and inputs[place] and inputs[place] not in constants:
                 raise ModelError(f"found {operator} with a shape that is computed, {_shown(inputs[place])}; only constant shapes are taken")
+        if operator == "Split":
+            _check_split(len(node["output"]), attributes, constants.get(inputs[1]) if len(inputs) > 1 else None)
         if operator == "Pad":
             _check_padding(constants.get(inputs[1] if len(inputs) > 1 else "", np.zeros(0)))
 
@@ -322,6 +323,15 @@ def _check_padding(pads: NDArray[Any]) -> None:
     axes = pads.astype(object).reshape(2, -1).T if pads.size <= 2 * LARGEST_RANK else []
     if len(axes) == 0 or math.prod(1 + abs(before) + abs(after) for before, after in axes) > LARGEST_PADDING:
         raise ModelError(f"found a Pad by {_shown(str(pads))}; at most {LARGEST_PADDING} times the size is taken")
+
+
+def _check_split(outputs: int, attributes: list[Fields], sizes: NDArray[Any] | None) -> None:
+    """Raises `ModelError` unless a Split has as many outputs as it says: onnxruntime ends the process where it has more."""
+    stated = [part["i"][0] for part in attributes if _text(part["name"]) == "num_outputs" and part["i"]]
+    if sizes is not None:
+        stated.append(sizes.size)
+    if any(number != outputs for number in stated):
+        raise ModelError(f"found a Split into {stated[0]} parts with {outputs} outputs; export it again with export-model")
 
 
 def _packed(part: memoryview) -> list[int]:

@@ -158,7 +158,8 @@ def _constant(rng: Random, model: onnx.ModelProto, _metadata: dict[str, Any]) ->
     elif rng.random() < 0.5:
         values = values.ravel()[: int(rng.integers(values.size + 1))]
     else:
-        values = np.nan_to_num(values).astype(_pick(rng, (np.float32, np.int32, np.int64, np.float64, np.uint8)))
+        with np.errstate(invalid="ignore"):  # whatever a cast makes of numbers out of range
+            values = np.nan_to_num(values).astype(_pick(rng, (np.float32, np.int32, np.int64, np.float64, np.uint8)))
     tensor.CopyFrom(numpy_helper.from_array(values, tensor.name))
 
 

@@ -230,6 +230,13 @@ def with_function(model: onnx.ModelProto) -> None:
     model.functions.append(helper.make_function("f", "F", ["a"], ["b"], [helper.make_node("Relu", ["a"], ["b"])], []))
 
 
+def split_into(parts: int) -> Callable[[onnx.ModelProto], object]:
+    def change(model: onnx.ModelProto) -> None:
+        next(attribute for attribute in node(model, "Split").attribute if attribute.name == "num_outputs").i = parts
+
+    return change
+
+
 ATTACKS: dict[str, tuple[Callable[[onnx.ModelProto], object], str]] = {
     "a constant of a terabyte": (reshaped(4, 2**38), r"constant theta_lower with shape \[4, 274877906944\], type 1, \d+ bytes of data"),
     "a size that is 0 in 64 bits": (reshaped(2**32, 2**32), "constant theta_lower with shape"),
@@ -248,6 +255,7 @@ ATTACKS: dict[str, tuple[Callable[[onnx.ModelProto], object], str]] = {
     "a graph in a node": (branching, "found a graph in an attribute"),
     "a tensor in a node": (tensor_in_a_node, "found a tensor in an attribute"),
     "a computed shape": (computed_shape, "Reshape with a shape that is computed, cell"),
+    "a split into fewer parts": (split_into(1), "found a Split into 1 parts with 2 outputs"),
     "a padding of terabytes": (replaced("border", np.array([2**40, 0, 0, 2**40])), "found a Pad by"),
     **{
         operator: (lambda model, operator=operator: setattr(node(model, "Relu"), "op_type", operator), f"found the operator {operator};")

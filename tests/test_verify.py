@@ -308,8 +308,11 @@ def change_marking(rng: Rng, model: Model, _cell: int) -> None:
 
 
 def widen_domain(rng: Rng, model: Model, _cell: int) -> None:
-    axis = str(rng.choice(["theta_rad", "z_m"]))
-    model.metadata["scene"]["domain"][axis]["width"] += 1e-6
+    """By a millionth, shared out over an axis's cells, which go on touching each other."""
+    axis = model.metadata["scene"]["domain"][str(rng.choice(["theta_rad", "z_m"]))]
+    first, cells = axis["centres"][0], len(axis["centres"])
+    axis["width"] += 1e-6 / cells
+    axis["centres"] = [first + place * axis["width"] for place in range(cells)]
 
 
 def change_tolerance(_rng: Rng, model: Model, _cell: int) -> None:
