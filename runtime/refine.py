@@ -93,7 +93,7 @@ class Refiner:
         self._by_altitude(sets)
         grid = _Grid.of(self.scene, sets)
         lit = _LitColumns.of(self.scene, witnesses, sets, grid)
-        offset = self._offsets(grid, lit)
+        offset = self._by_end_pixels(sets, grid, lit, self._offsets(grid, lit))
         if claims is not None:
             offset = self._by_claims(sets, grid, claims, offset)
         self._by_offset(sets, offset)
@@ -118,6 +118,40 @@ class Refiner:
         slow, fast = (1 / ratio[1:-1] for ratio in grid.ratio)
         low, high = np.minimum(low * slow, low * fast), np.maximum(high * slow, high * fast)
         return _largest_but(np.where(grid.crossed, low, -NO_BOUND), spoiled), _smallest_but(np.where(grid.crossed, high, NO_BOUND), spoiled)
+
+    def _by_end_pixels(self, sets: StateSet, grid: _Grid, lit: _LitColumns, offset: Interval) -> Interval:
+        """The offset's bounds, drawn in by the lit pixels at the ends of markings; only without missed pixels, which may be just there.
+
+        With row b the last one that the far end may lie in, the marking has a point in it, at the end or on the border above it, whichever
+        is lower; and likewise in the first row that the near end may lie in.
+        """
+        if self.missed_budget > 0:
+            return offset
+        far, near = np.floor(above(grid.far[1])), np.floor(below(grid.near[0]))
+        apart = below(grid.near[0]) > above(grid.far[1])
+        points = (
+            (far, np.maximum(far, below(grid.far[0])), above(grid.far[1])),
+            (near, below(grid.near[0]), np.minimum(near + 1, above(grid.near[1]))),
+        )
+        for row, start, stop in points:
+            low, high = self._offset_at(sets, lit, row - grid.rows[0], start, stop)
+            offset = np.where(apart, np.maximum(offset[0], low), offset[0]), np.where(apart, np.minimum(offset[1], high), offset[1])
+        return offset
+
+    def _offset_at(self, sets: StateSet, lit: _LitColumns, place: Floats, start: Floats, stop: Floats) -> Interval:
+        """Bounds on the offset, (markings, sets), if a point between rows `start` and `stop` lies in a lit pixel of the row at `place`."""
+        u0, tiny = self.scene.camera.u0, 1 / NO_BOUND
+        inside = np.clip(place, 0, lit.first.shape[1] - 1)
+        first, last = (np.take_along_axis(part, inside.astype(np.int64)[:, None], axis=1)[:, 0] for part in (lit.first, lit.last))
+        slow = scale_ratio(sets, tangent_of_row(self.scene.camera, start))[0]
+        fast = scale_ratio(sets, tangent_of_row(self.scene.camera, stop))[1]
+        known = (place == inside) & (slow > 0)
+        slow, fast = np.maximum(slow, tiny), np.maximum(fast, tiny)
+        low, high = first - (u0 + OUTWARD_PX), last + (1 - u0 + OUTWARD_PX)
+        return (
+            np.where(known, np.minimum(low / slow, low / fast), -NO_BOUND),
+            np.where(known, np.maximum(high / slow, high / fast), NO_BOUND),
+        )
 
     def _by_offset(self, sets: StateSet, offset: Interval) -> None:
         """Draws scale and x in by offset = (p_x - x) scale: marking by marking, and by the differences of markings, free of x."""
