@@ -133,7 +133,7 @@ class Estimator:
         self._fixed = self._domain_lower == self._domain_upper
         window = self._entries.window_and_beyond(REFINED_BEYOND_PX)
         self._refiner = Refiner(self.scene, int(self._budgets["missed_budget"]), int(self._budgets["extra_budget"]), window)
-        self._arguments = {"path": name, "missed_budget": missed_budget, "extra_budget": extra_budget, "sha256": model.sha256}
+        self._arguments = {"path": name, "missed_budget": missed_budget, "extra_budget": extra_budget, "sha256": self.sha256}
 
     @classmethod
     def load(
@@ -153,8 +153,7 @@ class Estimator:
         """
         source = packaged_model() if path is None else Path(path)
         content = read_model(source)
-        digest = hashlib.sha256(content).hexdigest()
-        if sha256 is not None and sha256.lower() != digest:
+        if sha256 is not None and sha256.lower() != (digest := hashlib.sha256(content).hexdigest()):
             raise ModelError(f"{source}: sha256 is {digest}, the caller trusts {sha256}; take the file from its source again")
         model = parse_model(content, str(source), BOX_TENSORS + MASK_TENSORS)
         return cls(model, str(source), threads, missed_budget, extra_budget)

@@ -128,30 +128,20 @@ class Refiner:
         if self.missed_budget > 0:
             return offset
         far, near = np.floor(above(grid.far[1])), np.floor(below(grid.near[0]))
-        apart = below(grid.near[0]) > above(grid.far[1])
-        points = (
-            (far, np.maximum(far, below(grid.far[0])), above(grid.far[1])),
-            (near, below(grid.near[0]), np.minimum(near + 1, above(grid.near[1]))),
-        )
-        for row, start, stop in points:
-            low, high = self._offset_at(sets, lit, row - grid.rows[0], start, stop)
-            offset = np.where(apart, np.maximum(offset[0], low), offset[0]), np.where(apart, np.minimum(offset[1], high), offset[1])
-        return offset
-
-    def _offset_at(self, sets: StateSet, lit: _LitColumns, place: Floats, start: Floats, stop: Floats) -> Interval:
-        """Bounds on the offset, (markings, sets), if a point between rows `start` and `stop` lies in a lit pixel of the row at `place`."""
-        u0, tiny = self.scene.camera.u0, 1 / NO_BOUND
+        start = tangent_of_row(self.scene.camera, np.stack([np.maximum(far, below(grid.far[0])), below(grid.near[0])], axis=1))
+        stop = tangent_of_row(self.scene.camera, np.stack([above(grid.far[1]), np.minimum(near + 1, above(grid.near[1]))], axis=1))
+        slow, fast = scale_ratio(sets, start)[0], scale_ratio(sets, stop)[1]
+        place = (np.stack([far, near], axis=1) - grid.rows[0]).astype(np.int64)
         inside = np.clip(place, 0, lit.first.shape[1] - 1)
-        first, last = (np.take_along_axis(part, inside.astype(np.int64)[:, None], axis=1)[:, 0] for part in (lit.first, lit.last))
-        slow = scale_ratio(sets, tangent_of_row(self.scene.camera, start))[0]
-        fast = scale_ratio(sets, tangent_of_row(self.scene.camera, stop))[1]
-        known = (place == inside) & (slow > 0)
-        slow, fast = np.maximum(slow, tiny), np.maximum(fast, tiny)
-        low, high = first - (u0 + OUTWARD_PX), last + (1 - u0 + OUTWARD_PX)
-        return (
-            np.where(known, np.minimum(low / slow, low / fast), -NO_BOUND),
-            np.where(known, np.maximum(high / slow, high / fast), NO_BOUND),
-        )
+        apart = (below(grid.near[0]) > above(grid.far[1]))[:, None]
+        known = apart & (place == inside) & (slow > 0)
+        slow, fast = np.maximum(slow, 1 / NO_BOUND), np.maximum(fast, 1 / NO_BOUND)
+        u0 = self.scene.camera.u0
+        low = np.take_along_axis(lit.first, inside, axis=1) - (u0 + OUTWARD_PX)
+        high = np.take_along_axis(lit.last, inside, axis=1) + (1 - u0 + OUTWARD_PX)
+        low = np.where(known, np.minimum(low / slow, low / fast), -NO_BOUND).max(axis=1)
+        high = np.where(known, np.maximum(high / slow, high / fast), NO_BOUND).min(axis=1)
+        return np.maximum(offset[0], low), np.minimum(offset[1], high)
 
     def _by_offset(self, sets: StateSet, offset: Interval) -> None:
         """Draws scale and x in by offset = (p_x - x) scale: marking by marking, and by the differences of markings, free of x."""
@@ -461,8 +451,10 @@ def connected_parts(sets: StateSet) -> list[NDArray[np.int64]]:
     """Numbers of the sets in each connected part of their union: parts are joined where boxes (theta, x, y, z) touch."""
     if len(sets) > MOST_TO_JOIN:
         return [np.arange(len(sets))]
-    lower, upper = sets.lower - STATE_MARGIN, sets.upper + STATE_MARGIN
-    touch = np.logical_and.reduce((lower[:, None] <= upper[None]) & (lower[None] <= upper[:, None]), axis=-1)
+    bounds = np.stack([sets.theta, sets.x, sets.y, sets.z])  # axes first, so that numpy compares whole rows of pairs
+    lower, upper = bounds[..., 0] - STATE_MARGIN, bounds[..., 1] + STATE_MARGIN
+    starts_before_end = np.logical_and.reduce(lower[:, :, None] <= upper[:, None], axis=0)
+    touch = starts_before_end & starts_before_end.T
     left: Bits = np.ones(len(sets), dtype=bool)
     parts: list[NDArray[np.int64]] = []
     while left.any():

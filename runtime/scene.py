@@ -258,8 +258,8 @@ class Tolerance:
 class EstimatorTraining:
     """How NN_e is trained (`build_model.state_network`): frames made by the supercover, with clutter and missed pixels."""
 
-    training_frames: int = 60_000
-    epochs: int = 10
+    training_frames: int = 100_000
+    epochs: int = 11
     batch: int = 128
     largest_clutter: float = 0.06
     """Densities of random clutter are drawn from 0 to this."""

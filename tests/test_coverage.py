@@ -16,7 +16,7 @@ import onnx
 import pytest
 from onnx import numpy_helper
 from scenes import CUT_BELOW, CUT_LEFT, FREE_X, PAPER, UNLIKE_MARKINGS
-from test_image import Point, exact_ends, near_ties, twin_image
+from test_image import DRAWN, Point, exact_ends, near_ties, twin_image
 from typer.testing import CliRunner
 
 pytest.importorskip("faery", reason="the extra 'recordings' is not installed")
@@ -79,18 +79,7 @@ def test_on_borders_the_images_are_the_exact_twins_and_the_runtimes_but_for_ties
     assert ties > 0
 
 
-@pytest.mark.parametrize(
-    ("start", "stop", "lit"),
-    [
-        (("1/2", "1/2"), ("1/2", "1/2"), {(0, 0)}),
-        (("1", "1"), ("1", "1"), {(1, 1)}),
-        (("1", "0"), ("1", "1"), {(1, 0), (1, 1)}),
-        (("0", "1"), ("1", "1"), {(0, 1), (1, 1)}),
-        (("0", "0"), ("2", "2"), {(0, 0), (1, 1), (2, 2)}),
-        (("2", "0"), ("0", "2"), {(2, 0), (1, 0), (1, 1), (0, 1), (0, 2)}),
-        (("1/2", "-9/2"), ("5/2", "7/2"), {(1, 0), (1, 1), (2, 1), (2, 2)}),
-    ],
-)
+@pytest.mark.parametrize(("start", "stop", "lit"), DRAWN)
 def test_lit_columns_of_segments_that_one_can_draw(start: tuple[str, str], stop: tuple[str, str], lit: set[tuple[int, int]]) -> None:
     """Lit pixels as (column, row), of rows 0 to 2."""
     ends = [(Fraction(u), Fraction(v)) for u, v in (start, stop)]

@@ -26,6 +26,17 @@ Point = tuple[Fraction, Fraction]
 RandomStates = Callable[[Scene, int, int], NDArray[np.float64]]
 NEAR_TIE_PX = Fraction(1, 10**9)
 """Far above what rounding a state and its projection to float64 moves a point by (some 1e-12 px), far below a pixel."""
+DRAWN = [
+    (("1/2", "1/2"), ("1/2", "1/2"), {(0, 0)}),
+    (("1", "1"), ("1", "1"), {(1, 1)}),
+    (("1", "0"), ("1", "1"), {(1, 0), (1, 1)}),
+    (("0", "1"), ("1", "1"), {(0, 1), (1, 1)}),
+    (("0", "0"), ("2", "2"), {(0, 0), (1, 1), (2, 2)}),
+    (("2", "0"), ("0", "2"), {(2, 0), (1, 0), (1, 1), (0, 1), (0, 2)}),
+    (("1/2", "1/2"), ("3/2", "3/4"), {(0, 0), (1, 0)}),
+    (("1/2", "-9/2"), ("5/2", "7/2"), {(1, 0), (1, 1), (2, 1), (2, 2)}),
+]
+"""Segments that one can draw, and their lit pixels of rows 0 to 2 as (column, row)."""
 
 
 # --- the naive twin ---
@@ -113,18 +124,7 @@ def rational_states(scene: Scene, count: int, seed: int) -> list[tuple[Fraction,
     return [(Fraction(round(10**6 * math.tan(theta / 2)), 10**6), x, y, z) for theta, x, y, z in states.tolist()]
 
 
-@pytest.mark.parametrize(
-    ("start", "stop", "lit"),
-    [
-        (("1/2", "1/2"), ("1/2", "1/2"), {(0, 0)}),
-        (("1", "1"), ("1", "1"), {(1, 1)}),
-        (("1", "0"), ("1", "1"), {(1, 0), (1, 1)}),
-        (("0", "1"), ("1", "1"), {(0, 1), (1, 1)}),
-        (("0", "0"), ("2", "2"), {(0, 0), (1, 1), (2, 2)}),
-        (("2", "0"), ("0", "2"), {(2, 0), (1, 0), (1, 1), (0, 1), (0, 2)}),
-        (("1/2", "1/2"), ("3/2", "3/4"), {(0, 0), (1, 0)}),
-    ],
-)
+@pytest.mark.parametrize(("start", "stop", "lit"), DRAWN)
 def test_the_twin_on_segments_that_one_can_draw(start: tuple[str, str], stop: tuple[str, str], lit: set[tuple[int, int]]) -> None:
     """Lit pixels as (column, row). A falling diagonal enters corners only, a rising one also the pixels it passes between them."""
     ends = [(Fraction(u), Fraction(v)) for u, v in (start, stop)]
