@@ -384,15 +384,17 @@ def test_the_frames_have_ties_and_every_answer(expected_of: Callable[[str], Expe
 
 
 def test_the_bound_on_the_state_is_tight(expected_of: Callable[[str], Expected]) -> None:
-    """Below 1e-4 rad or m, and missed, in most frames, by a network whose weights are rounded to bfloat16."""
+    """Below 2e-5 rad or m and 4e-8 more for each lit pixel, since sums grow with them; and missed, in most frames, by a network whose
+    weights are rounded to bfloat16."""
     expected = expected_of("committed")
     coarse = StateNetwork(expected.scene)
     coarse.load_state_dict({name: value.to(torch.bfloat16).to(torch.float32) for name, value in expected.network.state_dict().items()})
     missed = 0
     for case, (exact, bound) in expected.states.items():
-        assert (bound < 1e-4).all()
+        filtered = expected.outputs[case]["filtered"]
+        assert (bound < 2e-5 + 4e-8 * filtered.sum()).all()
         with torch.no_grad():
-            state = coarse(as_image(expected.outputs[case]["filtered"], expected.scene)).numpy()[0]
+            state = coarse(as_image(filtered, expected.scene)).numpy()[0]
         missed += bool((np.abs(state - exact) > bound).any())
     assert missed > 0.9 * len(expected.states)
 
