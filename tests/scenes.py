@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from hypothesis import settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -20,6 +21,11 @@ Frame = NDArray[np.uint8]
 QUICK = EstimatorTraining(training_frames=256, epochs=1)
 """NN_e is not certified: one epoch gives it a shape, and that is all these tests need of it."""
 PAPER = replace(Scene.load(Path(__file__).parents[1] / "models" / "paper.toml"), estimator=QUICK)
+
+
+def examples(count: int) -> settings:
+    """As many examples in the quick profile, and as many times more in a longer one as it draws of other tests."""
+    return settings(max_examples=count * settings.default.max_examples // 100)
 
 
 def seen_from(scene: Scene, u0: float, v0: float) -> Scene:

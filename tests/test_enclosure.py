@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
-from scenes import CUT_BELOW, CUT_LEFT, FREE_X, PAPER, UNLIKE_MARKINGS, Floats, seen_from, state_sets, states_in
+from scenes import CUT_BELOW, CUT_LEFT, FREE_X, PAPER, UNLIKE_MARKINGS, Floats, examples, seen_from, state_sets, states_in
 
 from build_model.enclosure import Columns, columns_that_may_be_lit, columns_that_must_be_lit
 from build_model.hough_bank import line_boxes
@@ -45,7 +45,7 @@ def images(scene: Scene, states: Floats) -> np.ndarray:
 
 
 @SCENES
-@settings(max_examples=50)
+@examples(50)
 @given(data=st.data())
 def test_the_image_of_each_state_lies_between_both_enclosures(scene: Scene, data: st.DataObject) -> None:
     drawn = data.draw(state_sets(scene))

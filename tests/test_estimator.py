@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
-from scenes import ONE_CELL, PAPER, SCENES, Floats, Frame, random_clutter, states_of
+from scenes import ONE_CELL, PAPER, SCENES, Floats, Frame, examples, random_clutter, states_of
 
 from build_model.export import export_model
 from runtime import Box, Estimator, FrameError, ModelError, Outcome
@@ -187,7 +187,7 @@ def test_many_frames_give_the_same_estimates(paper: Estimator, random_states: Ra
 # --- the shield: the proposal inside the box, or its centre ---
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(share=st.lists(st.floats(0, 1), min_size=4, max_size=4))
 def test_a_proposal_in_the_box_is_kept(estimator_of: EstimatorOf, share: list[float]) -> None:
     """Its faces included, to the last bit."""
@@ -202,7 +202,7 @@ def test_a_proposal_in_the_box_is_kept(estimator_of: EstimatorOf, share: list[fl
     assert (estimate.state == proposal).all()
 
 
-@settings(max_examples=40)
+@examples(40)
 @given(axis=st.integers(0, 3), side=st.sampled_from(["lower", "upper"]), distance=st.floats(0, 10))
 def test_a_proposal_outside_gives_way_to_the_centre(estimator_of: EstimatorOf, axis: int, side: str, distance: float) -> None:
     """By one unit in the last place, or far away."""
@@ -299,7 +299,7 @@ def test_a_box_within_the_domain_is_not_marked(paper: Estimator) -> None:
     assert not estimate.touches_boundary
 
 
-@settings(max_examples=25)
+@examples(25)
 @given(data=st.data())
 def test_a_state_on_a_face_is_marked(estimator_of: EstimatorOf, data: st.DataObject) -> None:
     """A box that holds it reaches that face."""

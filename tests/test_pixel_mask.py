@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scenes import PAPER
+from scenes import PAPER, examples
 
 from build_model.pixel_mask import Runs, Window, inset, paint, runs_of, widened, window_of
 from runtime.scene import Camera, Scene
@@ -65,7 +65,7 @@ def test_paint_is_the_double_loop(columns: Columns, window: tuple[int, int, int,
     assert (paint(columns, cut) == painted(columns)[:, *cut.slices]).all()
 
 
-@settings(max_examples=60)
+@examples(60)
 @given(radius_and_columns=st.integers(0, 3).flatmap(lambda radius: st.tuples(st.just(radius), markings(beyond=radius))))
 def test_widening_is_a_dilation_of_the_painted_bits(radius_and_columns: tuple[int, Columns]) -> None:
     """Of what lies beyond the frame too; then the frame cuts it."""

@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from rich.progress import Progress
+from scenes import examples
 
 from build_model.partition import partition
 from build_model.pixel_mask import Window
@@ -88,7 +89,6 @@ def test_the_printed_proposition_2_fails_on_a_parabola() -> None:
 
 
 @given(st.data())
-@settings(deadline=None)
 def test_proposition_2_contains_quadratic_maps(data: st.DataObject) -> None:
     """f_i(x) = x A_i x + B_i x over whole numbers: exact in float64, so the containment has no tolerance."""
     whole = st.integers(-5, 5)
@@ -140,7 +140,7 @@ def test_intervals_contain_points(data: st.DataObject, angle: float, spread: flo
 
 
 @given(boxes_of_states(), st.integers(0, 2**32 - 1))
-@settings(deadline=None, max_examples=40)
+@examples(40)
 def test_jacobian_bounds_contain_every_difference_quotient(box: tuple[Floats, Floats], seed: int) -> None:
     """By the mean value theorem a difference quotient of h along an axis is a value of the Jacobian between its points."""
     lower, upper = box
@@ -168,7 +168,7 @@ def test_jacobian_bounds_are_tight_on_a_small_box() -> None:
 
 @pytest.mark.parametrize("method", Method)
 @given(box=boxes_of_states(), seed=st.integers(0, 2**32 - 1))
-@settings(deadline=None, max_examples=40)
+@examples(40)
 def test_zeta_bounds_contain_samples(method: Method, box: tuple[Floats, Floats], seed: int) -> None:
     low, high = zeta_bounds(PAPER, *box, method)
     zeta = zeta_of(PAPER, states_in(*box, 200, seed))
@@ -177,7 +177,7 @@ def test_zeta_bounds_contain_samples(method: Method, box: tuple[Floats, Floats],
 
 
 @given(box=boxes_of_states())
-@settings(deadline=None, max_examples=40)
+@examples(40)
 def test_the_closed_form_is_tightest_and_attained(box: tuple[Floats, Floats]) -> None:
     """It lies within the other two, and states that attain it exist: corners, and the pitch at which an end crosses row v0."""
     low, high = zeta_bounds(PAPER, *box, Method.CLOSED_FORM)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scenes import (
@@ -20,6 +20,7 @@ from scenes import (
     UNLIKE_MARKINGS,
     Floats,
     Frame,
+    examples,
     random_clutter,
     state_sets,
     states_in,
@@ -64,7 +65,7 @@ def put_out(image: Frame, places: list[int]) -> Frame:
 
 
 @SCENES
-@settings(max_examples=30)
+@examples(30)
 @given(
     data=st.data(),
     seed=st.integers(0, 1000),
@@ -87,7 +88,7 @@ def test_a_consistent_state_is_never_lost(
 
 
 @SCENES
-@settings(max_examples=20)
+@examples(20)
 @given(data=st.data(), seed=st.integers(0, 1000), extra=st.integers(0, 6), missed=st.lists(st.integers(0, 10_000), max_size=2))
 def test_a_state_with_bounded_clutter_is_never_lost(scene: Scene, data: st.DataObject, seed: int, extra: int, missed: list[int]) -> None:
     """Theorem B: all claimed pixels are the runway's but for `extra`, which lie on and around it."""

@@ -10,9 +10,9 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
-from scenes import OFF_BY, SCENES, SHIFTED, Floats, Frame, random_clutter, states_of
+from scenes import OFF_BY, SCENES, SHIFTED, Floats, Frame, examples, random_clutter, states_of
 
 from runtime.camera import project
 from runtime.estimator import Estimate, Estimator
@@ -101,7 +101,7 @@ def test_any_clutter(estimator_of: EstimatorOf, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", EXACT)
-@settings(max_examples=20)
+@examples(20)
 @given(data=st.data(), density=st.sampled_from(DENSITIES), seed=st.integers(0, 1000))
 def test_states_that_hypothesis_finds(estimator_of: EstimatorOf, name: str, data: st.DataObject, density: float, seed: int) -> None:
     """Faces and corners of domain and cells among them."""
@@ -141,7 +141,7 @@ def test_missed_pixels_in_the_worst_places(estimator_of: EstimatorOf, name: str,
         check(estimator, state, seen, random_clutter(rng, scene.camera.shape, (0.0, 0.02, 0.2)[number % 3]))
 
 
-@settings(max_examples=25)
+@examples(25)
 @given(data=st.data(), missed=st.integers(1, 20), place=st.sampled_from(PLACES), seed=st.integers(0, 1000))
 def test_missed_pixels_that_hypothesis_finds(estimator_of: EstimatorOf, data: st.DataObject, missed: int, place: str, seed: int) -> None:
     estimator = estimator_of("paper", missed)
@@ -198,7 +198,7 @@ def test_a_camera_off_by_its_calibration(estimator_of: EstimatorOf, name: str) -
 
 
 @pytest.mark.parametrize("name", ["tolerant", "tolerant, cut left", "tolerant, barely above", "tolerant, barely below"])
-@settings(max_examples=20)
+@examples(20)
 @given(data=st.data(), shares=st.lists(st.floats(-1, 1), min_size=5, max_size=5))
 def test_calibrations_that_hypothesis_finds(estimator_of: EstimatorOf, name: str, data: st.DataObject, shares: list[float]) -> None:
     estimator = estimator_of(name)
