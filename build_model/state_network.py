@@ -293,6 +293,9 @@ def _reproducible(seed: int) -> Iterator[None]:
             torch.set_num_threads(1)
             torch.use_deterministic_algorithms(True)
             torch.manual_seed(seed)
+            # MKL picks the kernel of a function at its first call: if two threads make that one, one of them may get a kernel that is
+            # right to some thousand units in the last place only (pytorch/pytorch issue 188792). The loss takes roots in two threads.
+            torch.sqrt(torch.ones(1))
             yield
         finally:
             torch.set_num_threads(threads)
