@@ -6,7 +6,7 @@ what the frame shows. A state whose markings cross the border r of two rows ligh
     u(r) = u0 + (p_x - x) scale R(theta, r)  lies in the closed columns of a lit pixel above r, and of one below r
 
 up to the missed pixels. In a thin slice R is all but a number, and every border bounds each marking's offset (p_x - x) scale on both
-sides; so does the lit pixel of an end, wherever in its rows the end may be. Beyond the rows that all states of the slice cross, the first
+sides; so does, if none may be missed, the lit pixel of an end. Beyond the rows that all states of the slice cross, the first
 row without a usable lit pixel ends a marking, and so bounds its distance. Slices that contradict the frame are dropped; the others are cut
 finer, in the end only those that carry a face of the box.
 
