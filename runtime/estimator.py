@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from runtime.entries import BOX_TENSORS, MASK_TENSORS, Entries
 from runtime.image import dilated
 from runtime.model_file import ModelError, ModelFile, packaged_model, parse_model, read_model
-from runtime.refine import STATE_MARGIN, Refiner, connected_parts, joined
+from runtime.refine import Refiner, connected_parts, joined
 from runtime.scene import STATE_NAMES, Scene, SceneError
 from runtime.session import OUTPUTS, check_interface, open_session, reason_of
 from runtime.state_set import StateSet
@@ -248,7 +248,7 @@ class Estimator:
 
     def _regions(self, pieces: StateSet) -> tuple[Box, ...]:
         """Boxes of the connected parts of the pieces."""
-        return self._hulls(pieces.lower - STATE_MARGIN, pieces.upper + STATE_MARGIN, connected_parts(pieces))
+        return self._hulls(pieces.lower, pieces.upper, connected_parts(pieces))
 
     def _hulls(self, lower: NDArray, upper: NDArray, parts: list[NDArray[np.int64]]) -> tuple[Box, ...]:
         """The box of each part, within the domain, which holds the state by assumption."""

@@ -13,6 +13,11 @@ from numpy.typing import ArrayLike, NDArray
 OUTWARD_PX = 2.0**-20
 """Margin that every bound on a row or a column is widened by, in px."""
 
+ROUNDING_SHARE = 2.0**-46
+"""Share of its terms by which a bound is moved outward where they may be of any size: a hundred times float64's rounding of them all.
+
+The error of a sum or product of a few dozen roundings is at most so many times 2^-53 of its largest terms."""
+
 OUTWARD_RELATIVE = 2.0**-30
 """Share by which a lower bound must exceed an upper one before an interval of angles, altitudes or scales is called empty.
 
@@ -27,6 +32,21 @@ def below(values_px: ArrayLike) -> NDArray[np.float64]:
 def above(values_px: ArrayLike) -> NDArray[np.float64]:
     """Rows or columns that lie above the given ones by the margin."""
     return np.asarray(values_px) + OUTWARD_PX
+
+
+def lowered(values: ArrayLike, terms: ArrayLike) -> NDArray[np.float64]:
+    """Lower bounds on what `values` stand for; `terms` are the sizes of the terms that they are the sum of, or of themselves."""
+    return np.asarray(values) - ROUNDING_SHARE * np.asarray(terms)
+
+
+def raised(values: ArrayLike, terms: ArrayLike) -> NDArray[np.float64]:
+    """Upper bounds on what `values` stand for; `terms` as in `lowered`."""
+    return np.asarray(values) + ROUNDING_SHARE * np.asarray(terms)
+
+
+def column_margin_px(terms_px: ArrayLike) -> NDArray[np.float64]:
+    """Margin of a column that is the sum of terms of this size, px: `OUTWARD_PX`, and what rounding adds where they are large."""
+    return raised(OUTWARD_PX, terms_px)
 
 
 def first_touched(lower_px: ArrayLike) -> NDArray[np.int64]:

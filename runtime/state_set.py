@@ -59,6 +59,11 @@ class StateSet:
         """s(theta, t_ref) at both ends of theta, (sets, 2)."""
         return self.turn[0] * self.tangent[:, None] + self.turn[1]
 
+    @cached_property
+    def condition(self) -> Floats:
+        """(1 + |t_ref|) / s(theta, t_ref), at least 1, (sets,): what one rounding of the terms of s means relative to s itself."""
+        return (1 + np.abs(self.tangent)) / self.reference_fall.min(axis=1)
+
     @property
     def lower(self) -> Floats:
         """Smallest theta, x, y, z of each set, (sets, 4)."""

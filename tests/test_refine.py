@@ -29,7 +29,7 @@ from scenes import (
 from runtime.camera import ground_scale
 from runtime.estimator import Estimator
 from runtime.image import dilated, runway_image
-from runtime.refine import LARGEST_START, MOST_TO_JOIN, STATE_MARGIN, Refiner, connected_parts, joined
+from runtime.refine import LARGEST_START, MOST_TO_JOIN, Refiner, connected_parts, joined
 from runtime.rounding import inverted
 from runtime.scene import Scene
 from runtime.state_set import StateSet
@@ -49,10 +49,10 @@ SCENES = pytest.mark.parametrize("scene", CASES.values(), ids=CASES)
 
 
 def holds(scene: Scene, pieces: StateSet, state: Floats) -> bool:
-    """Is the state in one of the pieces, up to the margin that every refined box is given? The scale up to float64's error."""
+    """Is the state in one of the pieces? The scale up to float64's error."""
     row = scene.camera.v0 + scene.camera.focal_px * pieces.tangent
     scale = ground_scale(scene.camera, state[0], state[2], row)
-    inside = ((pieces.lower - STATE_MARGIN <= state) & (state <= pieces.upper + STATE_MARGIN)).all(axis=1)
+    inside = ((pieces.lower <= state) & (state <= pieces.upper)).all(axis=1)
     return bool((inside & ~inverted(pieces.scale[:, 0], scale) & ~inverted(scale, pieces.scale[:, 1])).any())
 
 
