@@ -88,15 +88,15 @@ class Refiner:
         return pieces
 
     def _contracted(self, witnesses: _Pixels, claims: _Pixels | None, sets: StateSet) -> StateSet:
-        """The sets without most of the states that the frame contradicts, and without empty sets."""
+        """The sets, whose arrays are overwritten, without most of the states that the frame contradicts, and without empty sets."""
         if len(sets) == 0:
             return sets
         size = max(LARGEST_BLOCK // (len(self.scene.runway.markings) * len(witnesses.canvas)), 1)
-        blocks = (sets[np.arange(first, min(first + size, len(sets)))] for first in range(0, len(sets), size))
+        blocks = (sets[first : first + size] for first in range(0, len(sets), size))
         return joined(*(self._contracted_block(witnesses, claims, block) for block in blocks))
 
     def _contracted_block(self, witnesses: _Pixels, claims: _Pixels | None, sets: StateSet) -> StateSet:
-        """`_contracted` for some sets at once, whose arrays are overwritten."""
+        """`_contracted` for some sets at once."""
         self._by_altitude(sets)
         grid = _Grid.of(self.scene, sets, witnesses)
         lit = _LitColumns.of(self.scene, witnesses, sets, grid)
@@ -212,7 +212,8 @@ class Refiner:
         first = _smallest_but(np.where(found, row + 1, np.inf), spoiled)
         self._by_reach(sets, grid, last, first)
         explained = claims.count(row, claimed.window).sum(axis=(0, 1))
-        offset_low[:, claims.canvas.sum() - explained > self.extra_budget] = np.inf
+        unexplained = claims.canvas.sum() - explained > self.extra_budget
+        offset_low[:, unexplained], offset_high[:, unexplained] = np.inf, -np.inf
         return np.maximum(offset[0], offset_low), np.minimum(offset[1], offset_high)
 
     def _by_reach(self, sets: StateSet, grid: _Grid, last: Floats, first: Floats) -> None:
@@ -468,6 +469,8 @@ def _cut(sets: StateSet, **parts: int) -> StateSet:
 
 def joined(*parts: StateSet) -> StateSet:
     """All sets of the given batches in one."""
+    if len(parts) == 1:
+        return parts[0]
     names = ("theta", "x", "y", "z", "scale", "tangent")
     return StateSet(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 

@@ -12,7 +12,7 @@ and s(theta, t) = sin(psi)/cos(phi) = t cos(theta) + sin(theta). Then
     a ground point d ahead, seen at row v:  y = d tan(psi),  g(v) = F (cos(theta) - t sin(theta)) / d,  0 < psi < pi/2
 
 Every monotonicity that is used is one of these, or is checked over the set where it depends on it (`end_rows`). Results are
-plain float64 bounds; `runtime.rounding` turns them outward.
+plain float64 bounds, which `runtime.rounding` turns outward where they are used; `contract` alone does so itself.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from runtime.rounding import lowered, raised
 from runtime.scene import Camera
 
 Floats = NDArray[np.float64]
@@ -46,7 +47,7 @@ class StateSet:
     def __len__(self) -> int:
         return len(self.theta)
 
-    def __getitem__(self, index: NDArray) -> StateSet:
+    def __getitem__(self, index: NDArray | slice) -> StateSet:
         return StateSet(self.theta[index], self.x[index], self.y[index], self.z[index], self.scale[index], self.tangent[index])
 
     @cached_property
@@ -104,16 +105,19 @@ def scale_range(camera: Camera, theta: Floats, y: Floats, tangent: Floats) -> tu
 
 
 def contract(camera: Camera, sets: StateSet) -> StateSet:
-    """The same sets with the intervals of theta and y drawn in by y = F s(theta, t_ref) / scale."""
+    """The same sets with the intervals of theta and y contracted by y = F s(theta, t_ref) / scale, rounded outward."""
     tangent = sets.tangent
     phi, secant = np.arctan(tangent), np.sqrt(1 + tangent**2)
     sine_low, sine_high = (sets.scale[:, side] * sets.y[:, side] / (camera.focal_px * secant) for side in (0, 1))
-    theta_low = np.maximum(sets.theta[:, 0], np.arcsin(np.clip(sine_low, 0, 1)) - phi)
+    psi_low = np.arcsin(np.clip(lowered(sine_low, sine_low), 0, 1))  # near 1 an arcsine makes much of its argument's rounding
+    psi_high = np.arcsin(np.clip(raised(sine_high, sine_high), 0, 1))
+    theta_low = np.maximum(sets.theta[:, 0], lowered(psi_low - phi, psi_low + np.abs(phi)))
     rises = reach(sets.theta[:, 1], tangent) >= 0  # up to straight down the sine bounds the angle from above too
-    theta_high = np.where(rises, np.minimum(sets.theta[:, 1], np.arcsin(np.clip(sine_high, 0, 1)) - phi), sets.theta[:, 1])
-    drawn_in = replace(sets, theta=np.stack([theta_low, theta_high], axis=-1))
-    y_low, y_high = altitude_range(camera, drawn_in)
-    return replace(drawn_in, y=np.stack([np.maximum(sets.y[:, 0], y_low), np.minimum(sets.y[:, 1], y_high)], axis=-1))
+    theta_high = np.where(rises, np.minimum(sets.theta[:, 1], raised(psi_high - phi, psi_high + np.abs(phi))), sets.theta[:, 1])
+    contracted = replace(sets, theta=np.stack([theta_low, theta_high], axis=-1))
+    y_low, y_high = altitude_range(camera, contracted)
+    y_low, y_high = lowered(y_low, y_low * contracted.condition), raised(y_high, y_high * contracted.condition)
+    return replace(contracted, y=np.stack([np.maximum(sets.y[:, 0], y_low), np.minimum(sets.y[:, 1], y_high)], axis=-1))
 
 
 def reference_fall_range(sets: StateSet) -> tuple[Floats, Floats]:
@@ -150,8 +154,9 @@ def end_rows(camera: Camera, sets: StateSet, end_z_m: ArrayLike) -> tuple[Floats
     cotangent = (sets.turn[0][:, 0] - sets.turn[1][:, 0] * sets.tangent) / sets.reference_fall[:, 0]
     falls = slope * np.maximum(beside(cotangent), 0) < 1 + slope**2
     # The row rises in y: where both bounds hold, the closer one is that of the larger or smaller of the two altitudes.
-    y_low = np.where(falls, np.maximum(beside(sets.y[:, 0]), beside(y_steep)), beside(sets.y[:, 0]))
-    y_high = np.where(falls, np.minimum(beside(sets.y[:, 1]), beside(y_flat)), beside(sets.y[:, 1]))
+    # No farther out than the set's own altitudes go: what lies beyond them may be behind the camera.
+    y_low = np.where(falls, beside(np.clip(y_steep, *sets.y.T)), beside(sets.y[:, 0]))
+    y_high = np.where(falls, beside(np.clip(y_flat, *sets.y.T)), beside(sets.y[:, 1]))
     low = _row(camera, sets, 1, y_low, far, beside)
     return low, _row(camera, sets, 0, y_high, near, beside)
 
