@@ -7,7 +7,7 @@ PYTHON ?= python3
 PIP_EXTRA ?=
 BIN := .venv/bin
 INSTALLED := .venv/installed
-SOURCES := $(wildcard build_model/*.py runtime/*.py)
+SOURCES := $(shell find build_model runtime -name "*.py")
 
 .PHONY: setup test lint types demo evidence clean
 .DELETE_ON_ERROR:
@@ -41,7 +41,7 @@ evidence: out/paper.onnx
 	$(BIN)/python -m pytest -m evidence
 	$(BIN)/python -m pytest --hypothesis-profile=long
 	$(BIN)/python scripts/fuzz.py $< --minutes 10 -o out/fuzz
-	$(BIN)/python scripts/coverage.py $< --frames 24000 -o out/coverage.json
+	$(BIN)/python scripts/coverage $< --frames 24000 -o out/coverage.json
 
 clean:
 	rm -rf .venv out dist build .pytest_cache .ruff_cache .hypothesis

@@ -34,10 +34,10 @@ from build_model.calibration import check_calibration
 from build_model.filter_graph import IR_VERSION, OPSET, GraphWriter, filter_graph
 from build_model.filter_network import FilterTables, assemble
 from build_model.hough_bank import CellBank, cell_bank
+from build_model.paper.reachability import PaperBound, paper_bound
 from build_model.partition import partition
-from build_model.reachability import PaperBound, paper_bound
 from build_model.state_network import TrainingReport, state_graph, train_state_network
-from runtime.model_file import FORMAT_VERSION, METADATA_KEY, ModelError, check_graph, metadata_digest
+from runtime.model.model_file import FORMAT_VERSION, METADATA_KEY, ModelError, check_graph, metadata_digest
 from runtime.rounding import OUTWARD_PX
 from runtime.scene import Scene
 
@@ -204,7 +204,7 @@ def user_network(scene: Scene, path: Path) -> onnx.GraphProto:
     """A user's NN_e, its constants as initialisers of raw bytes, as the runtime wants them.
 
     Raises `EstimatorError` unless it maps float32 [1, 1, height, width] to float32 [1, 4], with fixed shapes throughout and nothing that
-    the runtime would refuse (`runtime.model_file`).
+    the runtime would refuse (`runtime.model.model_file`).
     """
     try:
         model = onnx.load(path, load_external_data=False)

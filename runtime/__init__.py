@@ -8,7 +8,7 @@ Conventions: `runtime.camera`. What is guaranteed: `runtime.estimator` and docs/
 
 from runtime.estimator import Box, Estimate, Estimator, FrameError, Outcome
 from runtime.frames import EventError, FrameStream, events_to_frames
-from runtime.model_file import ModelError
+from runtime.model.model_file import ModelError
 from runtime.scene import Scene, SceneError
 
 __all__ = [

@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from runtime.entries import BOX_TENSORS, MASK_TENSORS, Entries
 from runtime.image import dilated
-from runtime.model_file import ModelError, ModelFile, packaged_model, parse_model, read_model
+from runtime.model.entries import BOX_TENSORS, MASK_TENSORS, Entries
+from runtime.model.model_file import ModelError, ModelFile, packaged_model, parse_model, read_model
+from runtime.model.session import OUTPUTS, check_interface, open_session, reason_of
 from runtime.refine import Refiner, connected_parts, joined
 from runtime.scene import STATE_NAMES, Scene, SceneError
-from runtime.session import OUTPUTS, check_interface, open_session, reason_of
 from runtime.state_set import StateSet
 
 REFINED_BEYOND_PX = 2
@@ -148,8 +148,8 @@ class Estimator:
         """Reads a model file; without a path, the paper's model that comes with the package.
 
         `missed_budget` and `extra_budget` replace the scene's. `sha256` is the digest of the file that the caller trusts; nothing of
-        another file is looked at. The file is checked before onnxruntime sees it (`runtime.model_file`). Raises `ModelError` for a file
-        that is missing, too large, not ours, damaged or of another version, and for a budget that it cannot keep.
+        another file is looked at. The file is checked before onnxruntime sees it (`runtime.model.model_file`). Raises `ModelError` for a
+        file that is missing, too large, not ours, damaged or of another version, and for a budget that it cannot keep.
         """
         source = packaged_model() if path is None else Path(path)
         content = read_model(source)

@@ -25,7 +25,7 @@ from rich.table import Table
 
 from build_model.export import export_model
 from runtime import Estimator, Scene
-from runtime.bench import cluttered_frames, machine
+from runtime.recordings.bench import cluttered_frames, machine
 from runtime.scene import Axis, Bank, Domain, EstimatorTraining
 
 CLUTTER = 0.02

@@ -4,7 +4,7 @@
 
 - sampled: the union of the images of random states of the cell. A lower bound: no sound filter is smaller.
 - S: the filters that the build uses, `build_model.spatial_filter`, at tolerance 0.
-- mixed monotonicity: the paper's way, Proposition 2 (corrected) on h and on NN_r, `build_model.reachability`.
+- mixed monotonicity: the paper's way, Proposition 2 (corrected) on h and on NN_r, `build_model.paper.reachability`.
 - intervals: interval arithmetic on h, then NN_r layer by layer.
 - closed form: the exact ranges of zeta and of phi_Lin, then layer by layer: how much of the loss is the box of zeta's.
 
@@ -26,8 +26,8 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
+from build_model.paper.reachability import Method, possible_pixels
 from build_model.partition import partition
-from build_model.reachability import Method, possible_pixels
 from build_model.spatial_filter import spatial_filters
 from runtime.image import lit_columns
 from runtime.scene import Scene, SceneError

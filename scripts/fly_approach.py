@@ -30,10 +30,10 @@ from rich.table import Table
 
 from build_model.spatial_filter import spatial_filters
 from runtime import Estimate, Estimator, ModelError, Scene
-from runtime.draw import Picture, contact_sheet, draw_estimate, draw_runway
 from runtime.frames import FrameStream
 from runtime.image import runway_image
-from runtime.recording import RecordingError, read_events
+from runtime.recordings.draw import Picture, contact_sheet, draw_estimate, draw_runway
+from runtime.recordings.recording import RecordingError, read_events
 from runtime.scene import STATE_NAMES, STATE_UNITS
 
 WINDOW_US = 40_000

@@ -39,8 +39,8 @@ from onnx.checker import ValidationError
 
 from runtime import Estimator, FrameError, FrameStream, ModelError, SceneError
 from runtime.frames import EventError, events_to_frames
-from runtime.model_file import METADATA_KEY, metadata_digest
-from runtime.recording import RecordingError, read_events
+from runtime.model.model_file import METADATA_KEY, metadata_digest
+from runtime.recordings.recording import RecordingError, read_events
 from runtime.scene import Scene
 
 CASE_SECONDS = 60

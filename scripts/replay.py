@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from runtime import Estimate, Estimator, ModelError
 from runtime.frames import EventError, FrameStream
-from runtime.recording import RecordingError, read_events
+from runtime.recordings.recording import RecordingError, read_events
 from runtime.scene import STATE_NAMES
 
 Packet = NDArray[Any]

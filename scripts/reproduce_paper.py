@@ -35,8 +35,8 @@ from build_model.hough_bank import cell_bank
 from build_model.partition import partition
 from runtime import Estimate, Estimator, ModelError, Scene
 from runtime.camera import project
-from runtime.draw import FILTERED, LINE_HEIGHT, STATE, History, Moment, Picture, colour_pixels, draw_history, draw_runway
 from runtime.image import runway_image
+from runtime.recordings.draw import FILTERED, LINE_HEIGHT, STATE, History, Moment, Picture, colour_pixels, draw_history, draw_runway
 
 PAPER_MINUTES_A_CELL, PAPER_SECONDS_A_FRAME, PAPER_ERRORS, PAPER_FRAMES = 20, 37, (0.0777, 0.045), 1320
 TESTS = (1, 24)

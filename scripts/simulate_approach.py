@@ -39,7 +39,7 @@ from rich.progress import track
 from rich.table import Table
 
 from runtime import Scene, SceneError
-from runtime.recording import EVENT
+from runtime.recordings.recording import EVENT
 from runtime.scene import STATE_NAMES, STATE_UNITS, Calibration
 
 WINDOW_US = 40_000
@@ -267,7 +267,7 @@ class EventCamera:
         self._blind_until_us = np.full(pixels, -np.inf)
 
     def blocks(self) -> Iterator[NDArray[Any]]:
-        """Packets of dtype `runtime.recording.EVENT`, sorted, from time 0 to the flight's end."""
+        """Packets of dtype `runtime.recordings.recording.EVENT`, sorted, from time 0 to the flight's end."""
         held = np.empty(0, dtype=EVENT)
         for start_us in range(0, self.flight.duration_us, BLOCK_US):
             end_us = min(start_us + BLOCK_US, self.flight.duration_us)

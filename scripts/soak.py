@@ -45,7 +45,7 @@ LOOP = """
 import os, sys
 import numpy
 from runtime import Estimator
-from runtime.bench import cluttered_frames
+from runtime.recordings.bench import cluttered_frames
 def resident():
     return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 estimator, count, refine = Estimator.load(sys.argv[1]), int(sys.argv[2]), sys.argv[3] == "True"

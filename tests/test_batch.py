@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from runtime.batch import CHUNK
-from runtime.bench import cluttered_frames
 from runtime.estimator import Box, Estimate, Estimator, FrameError
+from runtime.recordings.bench import cluttered_frames
 
 
 def same(first: Estimate, second: Estimate) -> bool:

@@ -15,11 +15,23 @@ import onnx
 import pytest
 
 from build_model.filter_network import row_width, rows_filled
-from runtime.bench import REFERENCE, WARM_UP, Latency, as_csv, benchmark, chart, cluttered_frames, latencies, measure, rate, throughput
 from runtime.estimator import Estimator
+from runtime.recordings.bench import (
+    REFERENCE,
+    WARM_UP,
+    Latency,
+    as_csv,
+    benchmark,
+    chart,
+    cluttered_frames,
+    latencies,
+    measure,
+    rate,
+    throughput,
+)
 from runtime.scene import Scene
 
-COMMAND = [sys.executable, "-c", "from runtime.bench import bench_model_command; bench_model_command()"]
+COMMAND = [sys.executable, "-c", "from runtime.recordings.bench import bench_model_command; bench_model_command()"]
 HEADER = {"processor": "abacus", "opencv": "5"}
 
 

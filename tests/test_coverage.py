@@ -21,19 +21,17 @@ from typer.testing import CliRunner
 
 pytest.importorskip("faery", reason="the extra 'recordings' is not installed")
 
-import coverage
-import coverage_frames as frames
-import coverage_states as states
 import typer
-from coverage_judge import Tally, claimed_by_none, judge_frame, quantile
-from coverage_models import DERIVED
-from coverage_scenarios import Scenario, camera_off, scenarios
-from coverage_states import Rng, Stage
+from coverage import campaign, frames, states
+from coverage.judge import Tally, claimed_by_none, judge_frame, quantile
+from coverage.models import DERIVED
+from coverage.scenarios import Scenario, camera_off, scenarios
+from coverage.states import Rng, Stage
 from rational_image import RationalState, RationalView, angle_is_at_least, lit_columns, turn
 
 from runtime.camera import project
 from runtime.image import runway_image
-from runtime.model_file import METADATA_KEY, metadata_digest
+from runtime.model.model_file import METADATA_KEY, metadata_digest
 from runtime.scene import Scene
 
 SPREAD = (PAPER, FREE_X, UNLIKE_MARKINGS, CUT_LEFT, CUT_BELOW)
@@ -117,7 +115,7 @@ def test_a_camera_that_is_off_is_yawed_then_rolled_zoomed_and_shifted(rng: Rng) 
 
 
 def test_calibrations_stay_within_their_bounds_and_reach_them(rng: Rng) -> None:
-    from coverage_models import OFF_BY
+    from coverage.models import OFF_BY
 
     stage = stage_of(replace(PAPER, calibration=OFF_BY))
     cameras = [camera_off(rng, stage) for _ in range(40)]
@@ -216,7 +214,7 @@ def test_a_tally_is_the_same_after_json(paper: Stage) -> None:
 
 def run(*arguments: object) -> Any:
     app = typer.Typer()
-    app.command()(coverage.main)
+    app.command()(campaign.main)
     return CliRunner().invoke(app, [*map(str, arguments), "--jobs", "1"])
 
 
@@ -237,25 +235,25 @@ def test_a_small_campaign_over_all_scenarios(repository: Path, tmp_path: Path) -
             assert counts["judged"] >= counts["frames"] == counts["certified"]
 
 
-def small_work(path: Path, seed: int, frames: int = 6) -> list[coverage.Chunk]:
-    return coverage.chunks_of({"given": path}, [each for each in scenarios(False, 8) if each.model == "given"][:3], frames, None, seed)
+def small_work(path: Path, seed: int, frames: int = 6) -> list[campaign.Chunk]:
+    return campaign.chunks_of({"given": path}, [each for each in scenarios(False, 8) if each.model == "given"][:3], frames, None, seed)
 
 
 def test_a_stopped_campaign_goes_on_and_another_one_starts_anew(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(coverage, "CHUNK", 2)
+    monkeypatch.setattr(campaign, "CHUNK", 2)
     path, file = repository / "models" / "paper.onnx", tmp_path / "chunks.jsonl"
     chunks = small_work(path, 1)
-    coverage.run_campaign(chunks, coverage.Journal(tmp_path / "whole.jsonl", chunks), 1)
-    whole = coverage.Journal(tmp_path / "whole.jsonl", chunks).done
-    coverage.run_campaign(chunks[:4], coverage.Journal(file, chunks), 1)
+    campaign.run_campaign(chunks, campaign.Journal(tmp_path / "whole.jsonl", chunks), 1)
+    whole = campaign.Journal(tmp_path / "whole.jsonl", chunks).done
+    campaign.run_campaign(chunks[:4], campaign.Journal(file, chunks), 1)
     with file.open("a") as journal:
         journal.write('{"campaign": "cut sh')  # killed while it wrote
-    kept = coverage.Journal(file, chunks)
+    kept = campaign.Journal(file, chunks)
     assert set(kept.done) == {chunk.key for chunk in chunks[:4]}
-    coverage.run_campaign(chunks, kept, 1)
+    campaign.run_campaign(chunks, kept, 1)
     assert len(file.read_text().splitlines()) == len(chunks)
-    assert coverage.Journal(file, chunks).done == whole
-    assert coverage.Journal(file, small_work(path, 2)).done == {}
+    assert campaign.Journal(file, chunks).done == whole
+    assert campaign.Journal(file, small_work(path, 2)).done == {}
 
 
 def with_shifted_entries(path: Path, to: Path, by: float) -> Path:
@@ -278,9 +276,9 @@ def test_a_wrong_model_is_found_and_its_frames_can_be_seen_again(
 ) -> None:
     path = with_shifted_entries(repository / "models" / "paper.onnx", tmp_path / "wrong.onnx", 0.04)
     chunks = small_work(path, 1)
-    journal = coverage.Journal(tmp_path / "chunks.jsonl", chunks)
-    coverage.run_campaign(chunks, journal, 1)
-    assert coverage.report(chunks, journal, tmp_path / "coverage.json") > 0
+    journal = campaign.Journal(tmp_path / "chunks.jsonl", chunks)
+    campaign.run_campaign(chunks, journal, 1)
+    assert campaign.report(chunks, journal, tmp_path / "coverage.json") > 0
     assert "--seed 1 --replay" in capsys.readouterr().out
     found = json.loads((tmp_path / "coverage.json").read_text())["violations"][0]
     frame = f"{found['scenario']}#{found['number']}"

@@ -13,10 +13,10 @@ pytest.importorskip("cv2", reason="the extra 'recordings' is not installed")
 
 import cv2
 
-from runtime import draw
 from runtime.camera import project
 from runtime.estimator import Box, Estimate, Outcome
 from runtime.image import runway_image
+from runtime.recordings import draw
 from runtime.scene import Camera, Scene
 
 SCENE = Scene.load(Path(__file__).resolve().parents[1] / "models" / "paper.toml")

@@ -19,11 +19,11 @@ from onnx import TensorProto, helper, numpy_helper
 from scenes import OFF_BY, ONE_CELL, PAPER, SCENES
 
 from build_model.export import EstimatorError, assumptions, export_model, user_network, write_atomically
+from build_model.paper.reachability import paper_bound
 from build_model.partition import partition
-from build_model.reachability import paper_bound
 from runtime import Estimator
 from runtime.image import runway_image
-from runtime.model_file import METADATA_KEY
+from runtime.model.model_file import METADATA_KEY
 from runtime.rounding import OUTWARD_PX
 from runtime.scene import Scene, SceneError, Tolerance
 

@@ -17,9 +17,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 
-from runtime.entries import BOX_TENSORS
 from runtime.estimator import Estimator
-from runtime.model_file import (
+from runtime.model.entries import BOX_TENSORS
+from runtime.model.model_file import (
     FORMAT_VERSION,
     LARGEST_FIELDS,
     LARGEST_FILE_BYTES,

@@ -16,9 +16,7 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 from scenes import examples
 
-from build_model.partition import partition
-from build_model.pixel_mask import Window
-from build_model.reachability import (
+from build_model.paper.reachability import (
     Interval,
     Method,
     PaperBound,
@@ -34,7 +32,9 @@ from build_model.reachability import (
     snap_outward,
     zeta_bounds,
 )
-from build_model.runway_network import RunwayNetwork, pixel_weights
+from build_model.paper.runway_network import RunwayNetwork, pixel_weights
+from build_model.partition import partition
+from build_model.pixel_mask import Window
 from runtime.camera import project
 from runtime.image import runway_image
 from runtime.rounding import OUTWARD_PX

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from runtime.frames import FrameStream
-from runtime.recording import EVENT, FAERY_SUFFIXES, HDF5_SUFFIXES, PACKET_EVENTS, RecordingError, read_events, sensor_shape
+from runtime.recordings.recording import EVENT, FAERY_SUFFIXES, HDF5_SUFFIXES, PACKET_EVENTS, RecordingError, read_events, sensor_shape
 
 SHAPE = (10, 20)
 RECORDINGS = Path(os.environ.get("GLIDEPROOF_RECORDINGS", Path(__file__).resolve().parents[2] / "shared" / "recordings"))

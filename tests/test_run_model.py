@@ -22,12 +22,12 @@ import typer
 from typer.testing import CliRunner, Result
 
 from runtime import Estimator
-from runtime.cli import run_model
-from runtime.draw import MOST_MOMENTS, History, Moment, draw_history
 from runtime.frames import FrameStream
 from runtime.image import runway_image
-from runtime.recording import EVENT
-from runtime.report import COLUMNS, TRUTH_COLUMNS, Truth, TruthError, missed_pixels
+from runtime.recordings.cli import run_model
+from runtime.recordings.draw import MOST_MOMENTS, History, Moment, draw_history
+from runtime.recordings.recording import EVENT
+from runtime.recordings.report import COLUMNS, TRUTH_COLUMNS, Truth, TruthError, missed_pixels
 
 MODEL = Path(__file__).parents[1] / "models" / "paper.onnx"
 RECORDINGS = Path(os.environ.get("GLIDEPROOF_RECORDINGS", Path(__file__).resolve().parents[2] / "shared" / "recordings"))

@@ -22,8 +22,8 @@ from build_model.pixel_mask import Window
 from runtime.camera import project
 from runtime.frames import FrameStream
 from runtime.image import dilated, runway_image
-from runtime.recording import read_events
-from runtime.report import missed_pixels
+from runtime.recordings.recording import read_events
+from runtime.recordings.report import missed_pixels
 from runtime.scene import Calibration, Domain, Scene, Tolerance
 
 STEADY = simulator.Vibration(yaw_rad=0.0, roll_rad=0.0, pitch_rad=0.0)

@@ -22,19 +22,19 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from typer.testing import CliRunner
 
-from build_model.ball_camera import PRECISION_BITS, BallCamera, BallEntry, Ends, Slice, columns, columns_crossed
-from build_model.cell_proof import Counterexample, prove_cell
 from build_model.export import build_banks, export_model
 from build_model.filter_graph import filter_graph
 from build_model.filter_network import FilterTables, assemble
 from build_model.hough_bank import CellBank, LineBoxes
-from build_model.model_graph import NETWORK_PREFIX, read_tables
 from build_model.pixel_mask import Bits, runs_of
-from build_model.verify import axis_borders, cell_boxes, cell_claims, check_outputs, displacement_px, verify_model
-from build_model.verify_cli import REFUTED, app
+from build_model.verify.ball_camera import PRECISION_BITS, BallCamera, BallEntry, Ends, Slice, columns, columns_crossed
+from build_model.verify.cell_proof import Counterexample, prove_cell
+from build_model.verify.cli import REFUTED, app
+from build_model.verify.model_graph import NETWORK_PREFIX, read_tables
+from build_model.verify.proof import axis_borders, cell_boxes, cell_claims, check_outputs, displacement_px, verify_model
 from runtime.camera import ground_scale, project, project_points
 from runtime.image import runway_image
-from runtime.model_file import METADATA_KEY, ModelError, metadata_digest
+from runtime.model.model_file import METADATA_KEY, ModelError, metadata_digest
 from runtime.scene import Axis, Bank, Calibration, Camera, Domain, Marking, Runway, Scene, Tolerance
 
 SCENE = Scene(

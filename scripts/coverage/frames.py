@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
-from coverage_states import Rng, Stage, image_of, into_domain, spatial_mask
 from numpy.typing import NDArray
 from rational_image import Frame, RationalState, RationalView
 
 from build_model.hough_bank import CellBank, cell_bank
+from coverage.states import Rng, Stage, image_of, into_domain, spatial_mask
 from runtime.frames import events_to_frames
-from runtime.recording import read_events
+from runtime.recordings.recording import read_events
 
 Pixels = NDArray[np.int64]
 """Numbers of pixels in the flattened frame, in the order in which they go dark."""

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from runtime.estimator import Estimate, Estimator
 from runtime.frames import FrameStream
 from runtime.image import runway_image
-from runtime.model_file import ModelError
+from runtime.model.model_file import ModelError
 from runtime.scene import Scene
 
 Frames = Sequence[NDArray[np.uint8]]
@@ -61,7 +61,7 @@ def cluttered_frames(scene: Scene, density: float, count: int, seed: int) -> Fra
 
 def recorded_frames(path: Path, shape: tuple[int, int], count: int) -> Frames:
     """`count` frames of a recording, evenly spread over it. Raises `RecordingError` and `EventError`."""
-    from runtime.recording import read_events
+    from runtime.recordings.recording import read_events
 
     frames = [frame for _, frame in FrameStream(shape, WINDOW_US).frames(read_events(path, shape))]
     return [frames[index] for index in np.linspace(0, len(frames) - 1, min(count, len(frames))).astype(int)] if frames else []
@@ -238,7 +238,7 @@ def bench_model_command() -> None:
     ) -> None:
         """Time the model beside OpenCV's line detectors, on one thread, on the same frames: table, bench.csv and bench.png."""
         from runtime.frames import EventError
-        from runtime.recording import RecordingError
+        from runtime.recordings.recording import RecordingError
 
         console = Console(width=None if sys.stdout.isatty() else 120)
         rows: list[Latency] = []

@@ -54,7 +54,7 @@ HDF5_GROUPS = ("", "events", "CD/events")
 """Where an HDF5 file may hold the columns: at the top, as DSEC does, or as Prophesee does."""
 EVENT_BYTES = {"evt2": 4, "evt3": 2, "dat": 8}
 """Size of a word: a file ends with a whole one."""
-READER = "import sys; from runtime.recording import write_packets; write_packets(sys.argv[1])"
+READER = "import sys; from runtime.recordings.recording import write_packets; write_packets(sys.argv[1])"
 """What the process that reads an AEDAT4 file runs."""
 BINARY_DAT_HEADER_BYTES = 2
 """A DAT file's header is followed by the type and the size of its events."""
@@ -251,7 +251,7 @@ def write_packets(path: str) -> None:
 
 def _read_apart(path: Path) -> Generator[NDArray[Any], None, None]:
     """The arrays that `write_packets` writes in a process of its own. Raises `RecordingError` with its text, or if it breaks down."""
-    folders = [str(Path(__file__).parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
+    folders = [str(Path(__file__).parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(folders)}
     command = [sys.executable, "-c", READER, str(path.resolve())]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment) as reader:

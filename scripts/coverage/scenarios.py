@@ -12,7 +12,9 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
-from coverage_frames import (
+from rational_image import RationalState, RationalView
+
+from coverage.frames import (
     Picture,
     Pixels,
     anywhere,
@@ -28,7 +30,7 @@ from coverage_frames import (
     second_runway,
     speckle,
 )
-from coverage_states import (
+from coverage.states import (
     Rng,
     Stage,
     cut_by_the_frame,
@@ -40,7 +42,6 @@ from coverage_states import (
     tangent_within,
     uniform,
 )
-from rational_image import RationalState, RationalView
 
 State = Callable[[Rng, Stage], RationalState]
 Layer = Callable[[Rng, Picture], None]

@@ -1,10 +1,10 @@
 """Counts how often a certificate holds: random and adversarial frames whose truth is known exactly.
 
-    python scripts/coverage.py [MODEL.onnx] [--frames N] [--recording FILE] [--only SCENARIO] [-o FILE.json]
-    python scripts/coverage.py [the same options] --replay "SCENARIO#NUMBER"
+    python scripts/coverage [MODEL.onnx] [--frames N] [--recording FILE] [--only SCENARIO] [-o FILE.json]
+    python scripts/coverage [the same options] --replay "SCENARIO#NUMBER"
 
 The runway's images are drawn in rational numbers by code that the build does not have (`rational_image`), the frames are those of
-`coverage_scenarios`, and `coverage_judge` says of which states a box must hold. One that does not, or one lit pixel of a judged runway that
+`coverage.scenarios`, and `coverage.judge` says of which states a box must hold. One that does not, or one lit pixel of a judged runway that
 `filtered` loses, is a violation: it is written with what is needed to replay it, and the exit code is 1. Finished chunks are kept beside
 the output: the same command goes on where it was stopped, and begins anew if model, code, seed or recording are others.
 """
@@ -22,15 +22,15 @@ from typing import Annotated
 
 import joblib
 import typer
-from coverage_judge import HALF_WIDTHS, Tally, Violation, judge_frame, quantile
-from coverage_models import DERIVED, build_model
-from coverage_scenarios import Scenario, scenarios
-from coverage_states import Stage
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn, track
 from rich.table import Table
 
 import runtime
+from coverage.judge import HALF_WIDTHS, Tally, Violation, judge_frame, quantile
+from coverage.models import DERIVED, build_model
+from coverage.scenarios import Scenario, scenarios
+from coverage.states import Stage
 from runtime import Estimator
 
 CHUNK = 250
@@ -105,7 +105,7 @@ def digest(paths: Iterable[Path]) -> str:
 def code() -> list[Path]:
     """The files that decide what a frame is and what is said of it."""
     here = Path(__file__).parent
-    return [*sorted(Path(runtime.__file__).parent.glob("*.py")), *sorted(here.glob("coverage*.py")), here / "rational_image.py"]
+    return [*sorted(Path(runtime.__file__).parent.rglob("*.py")), *sorted(here.glob("*.py")), here.parent / "rational_image.py"]
 
 
 def chunks_of(models: dict[str, Path], chosen: list[Scenario], frames: int, recording: Path | None, seed: int) -> list[Chunk]:
@@ -239,7 +239,3 @@ def main(
         print(f"stopped: {len(journal.done)} of {len(chunks)} chunks are kept in {journal.path}; the same command goes on", file=sys.stderr)
         sys.exit(130)
     sys.exit(int(report(chunks, journal, output) > 0))
-
-
-if __name__ == "__main__":
-    typer.run(main)

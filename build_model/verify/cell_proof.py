@@ -1,6 +1,6 @@
 """What is proved of one cell: its entries cover it, and S, O, K and the entries' boxes hold what they claim.
 
-For each entry and each row, the columns that its states light are enclosed by `build_model.ball_camera` over slices of theta, halved
+For each entry and each row, the columns that its states light are enclosed by `build_model.verify.ball_camera` over slices of theta, halved
 until the claim holds in each or a state refutes it:
 
     O  the image of every state, widened by the tolerance and clipped to the frame, is inside O; and O is inside S
@@ -21,8 +21,8 @@ import numpy as np
 from flint import arb, ctx  # pyright: ignore[reportMissingModuleSource]
 from numpy.typing import NDArray
 
-from build_model.ball_camera import PRECISION_BITS, BallCamera, BallEntry, Ends, Range, Slice, columns, columns_crossed
 from build_model.pixel_mask import Bits, Window
+from build_model.verify.ball_camera import PRECISION_BITS, BallCamera, BallEntry, Ends, Range, Slice, columns, columns_crossed
 from runtime.scene import STATE_NAMES, Scene
 
 Runs = list[tuple[float, float]]

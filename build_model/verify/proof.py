@@ -3,10 +3,10 @@
 What is proved, and by what arithmetic:
 
     cells      the borders are the float64 numbers nearest to the scene's: exact fractions
-    graph      NN_F is, node by node and bit by bit, the graph of the tables in the file (`build_model.model_graph`); and on frames
+    graph      NN_F is, node by node and bit by bit, the graph of the tables in the file (`build_model.verify.model_graph`); and on frames
                drawn at random, onnxruntime's outputs are those that the masks define, counted pixel by pixel: integers
     sizes      |K|, its least value, the budgets' defaults and the stated assumptions agree: integers
-    masks, boxes and cover of every cell (`build_model.cell_proof`): Arb's balls of 64 bits, from the plain camera equations
+    masks, boxes and cover of every cell (`build_model.verify.cell_proof`): Arb's balls of 64 bits, from the plain camera equations
     tolerance  line_px covers what the calibration can move a marking by (`displacement_px` here): Arb's balls
 
 No mask, bound or rounding of the build is used; shared with it are the scene's reader and the writer of the expected graph.
@@ -31,14 +31,24 @@ from flint import arb, ctx  # pyright: ignore[reportMissingModuleSource]
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from build_model.ball_camera import PRECISION_BITS
-from build_model.cell_proof import PADDING_SIZE, CellClaim, CellProof, Counterexample, MaskRuns, PaintedRuns, Refuted, demand, prove_cell
 from build_model.export import assumptions
 from build_model.filter_network import FilterTables
-from build_model.model_graph import check_graph, read_tables
 from build_model.partition import Partition
 from build_model.pixel_mask import Window
-from runtime.model_file import METADATA_KEY, ModelError, parse_model
+from build_model.verify.ball_camera import PRECISION_BITS
+from build_model.verify.cell_proof import (
+    PADDING_SIZE,
+    CellClaim,
+    CellProof,
+    Counterexample,
+    MaskRuns,
+    PaintedRuns,
+    Refuted,
+    demand,
+    prove_cell,
+)
+from build_model.verify.model_graph import check_graph, read_tables
+from runtime.model.model_file import METADATA_KEY, ModelError, parse_model
 from runtime.scene import Axis, Scene, SceneError
 
 Progress = Callable[[int, int], None]

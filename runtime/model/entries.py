@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.model_file import ModelError
+from runtime.model.model_file import ModelError
 from runtime.scene import STATE_NAMES, Scene
 from runtime.state_set import StateSet, tangent_of_row
 

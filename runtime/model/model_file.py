@@ -27,8 +27,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-PACKAGED_MODELS = (Path(__file__).parent / "models", Path(__file__).parents[1] / "models")
-"""Where the paper's model lies: in a wheel beside this file, in a checkout at the top."""
+PACKAGED_MODELS = (Path(__file__).parents[1] / "models", Path(__file__).parents[2] / "models")
+"""Where the paper's model lies: in a wheel inside the package, in a checkout at the top."""
 FORMAT_VERSION = 1
 METADATA_KEY = "glideproof"
 

@@ -4,8 +4,8 @@
 |---|---|
 | estimates.csv | a line a window: see `COLUMNS` |
 | summary.json | counts, means, the model's digest and assumptions |
-| overlay.mp4, overlay_<window>.png | `runtime.draw.draw_estimate` |
-| state.png | `runtime.draw.draw_history`: state against time with the certified band |
+| overlay.mp4, overlay_<window>.png | `runtime.recordings.draw.draw_estimate` |
+| state.png | `runtime.recordings.draw.draw_history`: state against time with the certified band |
 
 Every file is written beside its name and renamed when the report is closed, also after an interruption. With a truth, every window is
 judged: whether Theorem A's assumptions hold for it, and whether the certified box has the truth in it.
@@ -23,9 +23,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.draw import History, Moment, Picture, draw_estimate, draw_history
 from runtime.estimator import Estimate, Estimator
 from runtime.image import dilated, runway_image
+from runtime.recordings.draw import History, Moment, Picture, draw_estimate, draw_history
 from runtime.scene import STATE_NAMES, STATE_UNITS, Scene
 
 STATE_COLUMNS = [f"{name}_{unit}" for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True)]

@@ -1,4 +1,4 @@
-"""The command verify-model. It parses and prints; `build_model.verify` does the work."""
+"""The command verify-model. It parses and prints; `build_model.verify.proof` does the work."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 if TYPE_CHECKING:
-    from build_model.verify import VerificationReport
+    from build_model.verify.proof import VerificationReport
 
 try:
     import typer
@@ -29,8 +29,8 @@ def verify_model(
 ) -> None:
     """Prove a model's certificate anew, from its own tensors and the scene in its metadata. Exit code 1: a counterexample; 2: unusable."""
     try:
-        from build_model.verify import verify_model
-        from runtime.model_file import ModelError
+        from build_model.verify.proof import verify_model
+        from runtime.model.model_file import ModelError
     except ImportError as error:
         fail(f"verify-model: the package {error.name!r} is missing; pip install 'glideproof[build]'")
     console = Console()

@@ -13,11 +13,11 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
-from coverage_frames import Picture
-from coverage_scenarios import Scenario
-from coverage_states import Stage, estimator_of, image_of, spatial_mask
 from rational_image import Frame, RationalState
 
+from coverage.frames import Picture
+from coverage.scenarios import Scenario
+from coverage.states import Stage, estimator_of, image_of, spatial_mask
 from runtime import Estimate
 
 GRID = 1e-4

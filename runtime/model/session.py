@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import onnxruntime
 
-from runtime.model_file import ModelError
+from runtime.model.model_file import ModelError
 from runtime.scene import Scene
 
 OUTPUTS = ("cell", "support", "mismatch", "passes", "cell_lower", "cell_upper", "filtered", "network_state")

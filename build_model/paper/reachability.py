@@ -24,8 +24,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from build_model.paper.runway_network import ABS_PAIRS, MIN_PAIRS, pixel_weights
 from build_model.pixel_mask import Bits, Window
-from build_model.runway_network import ABS_PAIRS, MIN_PAIRS, pixel_weights
 from runtime.camera import project, row_of_point
 from runtime.rounding import above, below
 from runtime.scene import Scene

@@ -1,4 +1,4 @@
-"""The runtime's command: `run-model` takes a recording to estimates. It parses and prints; `runtime.report` writes."""
+"""The runtime's command: `run-model` takes a recording to estimates. It parses and prints; `runtime.recordings.report` writes."""
 
 from __future__ import annotations
 
@@ -54,9 +54,9 @@ def run_model(
 
         from runtime.estimator import Estimator
         from runtime.frames import EventError, FrameStream
-        from runtime.model_file import ModelError
-        from runtime.recording import RecordingError, read_events
-        from runtime.report import Report, Truth, TruthError
+        from runtime.model.model_file import ModelError
+        from runtime.recordings.recording import RecordingError, read_events
+        from runtime.recordings.report import Report, Truth, TruthError
     except ImportError as error:
         fail(f"run-model: the package {error.name!r} is missing; pip install 'glideproof[recordings]'")
     console = Console(width=None if sys.stdout.isatty() else 120)
@@ -100,7 +100,7 @@ def _microseconds(milliseconds: float) -> int:
 
 def _nonempty(recording: Path, packets: Iterator[NDArray[Any]]) -> Iterator[NDArray[Any]]:
     """The same packets, once one with an event is seen. Raises `RecordingError` if there is none, or if the file is unusable."""
-    from runtime.recording import RecordingError
+    from runtime.recordings.recording import RecordingError
 
     for packet in packets:
         if len(packet):

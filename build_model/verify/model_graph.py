@@ -16,12 +16,12 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from build_model.cell_proof import demand
 from build_model.filter_graph import BIT, IR_VERSION, OPSET, filter_graph
 from build_model.filter_network import FilterTables
 from build_model.partition import Partition
 from build_model.pixel_mask import Window
 from build_model.run_table import RunTable, SpatialRuns
+from build_model.verify.cell_proof import demand
 from runtime.scene import STATE_NAMES, Scene
 
 Part = onnx.NodeProto | onnx.ValueInfoProto

@@ -1,0 +1,1 @@
+"""The paper's own formulas, corrected: references and oracles beside what the build uses."""

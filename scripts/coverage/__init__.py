@@ -1,0 +1,1 @@
+"""The coverage campaign: counts how often a certificate holds."""
