@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 
-from build_model.pixel_mask import Window
+from build_model.window import Window
 from runtime.rounding import above
 from runtime.scene import Scene, SceneError
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import signal
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any
+
+from build_model.assumptions import assumptions
+from runtime.errors import INTERRUPTED, fail
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -21,17 +23,9 @@ try:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
     from rich.table import Table
 except ImportError as error:
-    raise SystemExit(f"export-model: the package {error.name!r} is missing; pip install 'glideproof[build]'") from None
+    fail(f"export-model: the package {error.name!r} is missing; pip install 'glideproof[build]'")
 
 DEFAULT_SCENE = Path("models/paper.toml")
-USER_ERROR = 2
-INTERRUPTED = 130
-
-
-def fail(message: object, code: int = USER_ERROR) -> NoReturn:
-    """One line on stderr, then exit."""
-    print(" ".join(str(message).split()), file=sys.stderr)
-    raise typer.Exit(code)
 
 
 def export_model(
@@ -81,7 +75,8 @@ def _interrupts_end_in_a_line(target: Path) -> Iterator[None]:
 def _export(console: Console, scene: Path, target: Path, **options: Any) -> tuple[Scene, ExportReport]:
     """Reads the scene and builds the model, with a progress bar. torch is imported here, where an interrupt is provided for."""
     try:
-        from build_model.export import ClusterError, EstimatorError, export_model
+        from build_model.export import ClusterError, export_model
+        from build_model.user_network import EstimatorError
         from runtime.scene import Scene, SceneError
     except ModuleNotFoundError as error:
         fail(f"export-model: the package {error.name!r} is missing; pip install 'glideproof[build]'")
@@ -114,8 +109,6 @@ class _Bars:
 
 
 def _print_summary(console: Console, scene: Scene, target: Path, report: ExportReport) -> None:
-    from build_model.export import assumptions
-
     table = Table(title=str(target), show_header=False, title_justify="left")
     rows = {
         "cells": report.cells,

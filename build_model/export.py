@@ -1,15 +1,14 @@
 """export-model: scene in, one ONNX file with NN_F and NN_e out.
 
-The certified part is built cell by cell (`hough_bank`), laid out (`filter_network`) and written as a graph (`filter_graph`); NN_e is
-trained on frames that this very graph filters (`state_network`), or taken from the user; both become one graph, with everything that
-a runtime or a verifier must know in its metadata. The same scene, seed and versions give the same bytes, whoever builds the cells.
+The certified part is built cell by cell (`hough_bank`), laid out (`assembly`) and written as a graph (`filter_graph`); NN_e is trained on
+frames that this very graph filters (`state_network`), or taken from the user (`user_network`). Both become one graph, with everything
+that a runtime or a verifier must know in its metadata. The same scene, seed and versions give the same bytes, whoever builds the cells.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 import platform
 import time
 from collections.abc import Callable, Iterator
@@ -24,35 +23,30 @@ import joblib
 import numpy as np
 import onnx
 import onnx.compose
-import onnx.shape_inference
-import onnx.version_converter
 import onnxruntime
 from numpy.typing import NDArray
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, helper
 
+from build_model.assembly import assemble
+from build_model.assumptions import assumptions
 from build_model.calibration import check_calibration
-from build_model.filter_graph import IR_VERSION, OPSET, GraphWriter, filter_graph
-from build_model.filter_network import FilterTables, assemble
+from build_model.filter_graph import GraphWriter, filter_graph
+from build_model.filter_tables import FilterTables
 from build_model.hough_bank import CellBank, cell_bank
-from build_model.paper.reachability import PaperBound, paper_bound
+from build_model.paper.paper_bound import PaperBound, paper_bound
 from build_model.partition import partition
 from build_model.state_network import TrainingReport, state_graph, train_state_network
-from runtime.model.model_file import FORMAT_VERSION, METADATA_KEY, ModelError, check_graph, metadata_digest
+from build_model.user_network import bare, user_network
+from runtime.model.format import FORMAT_VERSION, IR_VERSION, METADATA_KEY, NETWORK_OUTPUT, NETWORK_PREFIX, OPSET, metadata_digest
 from runtime.rounding import OUTWARD_PX
 from runtime.scene import Scene
+from runtime.whole_file import write_whole
 
 Progress = Callable[[str, int, int, float | None], None]
 """Called with a stage, steps done, steps in all, and the loss where there is one."""
-NETWORK_PREFIX = "state_network/"
-CONSTANT_VALUES = {"value": None, "value_float": np.float32, "value_floats": np.float32, "value_int": np.int64, "value_ints": np.int64}
-"""How a Constant may hold its value: as a tensor, or as numbers of the type given."""
 CONNECT_SECONDS = 10
 """How long the scheduler of a cluster may take to answer."""
 VERSIONS = ("glideproof", "numpy", "onnx", "onnxruntime", "torch")
-
-
-class EstimatorError(ValueError):
-    """A user's network that cannot serve as NN_e."""
 
 
 class ClusterError(RuntimeError):
@@ -117,7 +111,7 @@ def export_model(
         graph = _joined(filter_part, network)
         bounds = paper_bounds(scene, jobs, dask)
         content = _serialised(graph, _metadata(scene, tables, graph, shift_px, bounds, report, seed))
-        write_atomically(Path(path), content)
+        write_whole(Path(path), content)
     return ExportReport(
         cells=len(banks),
         entries=sum(len(bank) for bank in banks),
@@ -200,109 +194,21 @@ def _state_network(
     return state_graph(network, OPSET).graph, report
 
 
-def user_network(scene: Scene, path: Path) -> onnx.GraphProto:
-    """A user's NN_e, its constants as initialisers of raw bytes, as the runtime wants them.
-
-    Raises `EstimatorError` unless it maps float32 [1, 1, height, width] to float32 [1, 4], with fixed shapes throughout and nothing that
-    the runtime would refuse (`runtime.model.model_file`).
-    """
-    try:
-        model = onnx.load(path, load_external_data=False)
-        onnx.checker.check_model(model)
-        model = onnx.version_converter.convert_version(model, OPSET) if model.opset_import[0].version != OPSET else model
-        graph = _with_plain_constants(model.graph)
-        shapes = onnx.shape_inference.infer_shapes(
-            helper.make_model(graph, opset_imports=model.opset_import), strict_mode=True, data_prop=True
-        )
-    except OSError as error:
-        raise EstimatorError(f"{path}: cannot be read ({error.strerror}); give the path of an ONNX file") from error
-    except Exception as error:  # onnx's parser, checker and converter raise classes that share only this one
-        reason = " ".join(str(error).split())
-        raise EstimatorError(f"{path}: not a usable ONNX model ({reason:.160})") from error
-    inputs = list(graph.input)
-    expected = f"one input float32 [1, 1, {scene.camera.height}, {scene.camera.width}] and one output float32 [1, 4]"
-    found = f"inputs {[_described(value) for value in inputs]} and outputs {[_described(value) for value in graph.output]}"
-    wanted = [f"FLOAT {[1, 1, *scene.camera.shape]}"], [f"FLOAT {[1, 4]}"]
-    if ([_described(value) for value in inputs], [_described(value) for value in graph.output]) != wanted:
-        raise EstimatorError(f"{path}: found {found}; expected {expected}")
-    if any(domain.domain not in ("", "ai.onnx") for domain in model.opset_import) or model.functions:
-        raise EstimatorError(f"{path}: found operators or functions of its own; expected standard operators only")
-    _check_static(path, shapes.graph)
-    try:
-        check_graph(_bare(graph).SerializeToString())
-    except ModelError as error:
-        raise EstimatorError(f"{path}: {error}") from error
-    return graph
-
-
-def _with_plain_constants(graph: onnx.GraphProto) -> onnx.GraphProto:
-    """The graph with every Constant among the initialisers, these as raw bytes, and none of them an input too."""
-    plain = onnx.GraphProto()
-    plain.CopyFrom(graph)
-    constants = [node for node in plain.node if node.op_type == "Constant" and node.attribute[0].name in CONSTANT_VALUES]
-    for node in constants:
-        value = helper.get_attribute_value(node.attribute[0])
-        dtype = CONSTANT_VALUES[node.attribute[0].name]
-        array = numpy_helper.to_array(value) if dtype is None else np.array(value, dtype=dtype)
-        plain.initializer.append(numpy_helper.from_array(array, node.output[0]))
-        plain.node.remove(node)
-    for tensor in plain.initializer:
-        tensor.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensor), tensor.name))
-    given = {tensor.name for tensor in plain.initializer}
-    for value in [value for value in plain.input if value.name in given]:
-        plain.input.remove(value)
-    return plain
-
-
-def _check_static(path: Path, inferred: onnx.GraphProto) -> None:
-    """Raises `EstimatorError` unless every tensor between the nodes has a fixed shape."""
-    values = {value.name: value for value in (*inferred.value_info, *inferred.output)}
-    for node in inferred.node:
-        for name in filter(None, node.output):
-            shown = _described(values[name]) if name in values else "of unknown shape"
-            dims = values[name].type.tensor_type.shape.dim if name in values else []
-            if (
-                name not in values
-                or not values[name].type.tensor_type.HasField("shape")
-                or not all(dim.HasField("dim_value") for dim in dims)
-            ):
-                raise EstimatorError(
-                    f"{path}: found {name!r} ({node.op_type}), {shown}; expected fixed shapes throughout: export it with them"
-                )
-
-
-def _described(value: onnx.ValueInfoProto) -> str:
-    tensor = value.type.tensor_type
-    dims = [dim.dim_value if dim.HasField("dim_value") else dim.dim_param or "?" for dim in tensor.shape.dim]
-    return f"{TensorProto.DataType.Name(tensor.elem_type)} {dims}"
-
-
 def _joined(filter_part: onnx.GraphProto, network: onnx.GraphProto) -> onnx.GraphProto:
     """NN_e behind NN_F: `network_state` = NN_e(filtered)."""
     g = GraphWriter()
-    network = onnx.compose.add_prefix_graph(_bare(network), NETWORK_PREFIX)
+    network = onnx.compose.add_prefix_graph(bare(network), NETWORK_PREFIX)
     image = g.node("Unsqueeze", "filtered_image", "filtered", g.whole("batch_and_channel", 0, 1))
     elem_type = network.input[0].type.tensor_type.elem_type
     image = image if elem_type == TensorProto.UINT8 else g.node("Cast", "filtered_float", image, to=TensorProto.FLOAT)
     feed = helper.make_node("Identity", [image], [network.input[0].name], name="network_input")
-    g.node("Reshape", "network_state", network.output[0].name, g.whole("state_shape", 4))
+    g.node("Reshape", NETWORK_OUTPUT, network.output[0].name, g.whole("state_shape", 4))
     joined = onnx.GraphProto()
     joined.CopyFrom(filter_part)
     joined.node.extend([*g.nodes[:-1], feed, *network.node, g.nodes[-1]])
     joined.initializer.extend([*g.constants, *network.initializer])
-    joined.output.append(helper.make_tensor_value_info("network_state", TensorProto.FLOAT, [4]))
+    joined.output.append(helper.make_tensor_value_info(NETWORK_OUTPUT, TensorProto.FLOAT, [4]))
     return joined
-
-
-def _bare(network: onnx.GraphProto) -> onnx.GraphProto:
-    """The graph without notes of how it came about, which name files of the machine that made it."""
-    bare = onnx.GraphProto()
-    bare.CopyFrom(network)
-    for part in (bare, *bare.node, *bare.input, *bare.output, *bare.initializer):
-        part.ClearField("metadata_props")
-        part.ClearField("doc_string")
-    bare.ClearField("value_info")
-    return bare
 
 
 def _metadata(
@@ -329,20 +235,6 @@ def _metadata(
     }
 
 
-def assumptions(scene: Scene) -> list[str]:
-    """What every certificate of this model takes for granted (Theorem A; the last line, Theorem B, where it is switched on)."""
-    tolerance = scene.tolerance
-    near = f" within {tolerance.line_px} px" if tolerance.line_px else ""
-    lines = [
-        "The state lies in the scene's domain; a box that reaches a face of the domain says so.",
-        f"No roll or yaw, and the camera as in the scene, up to its [calibration] and {tolerance.line_px} px.",
-        f"At most {tolerance.missed_budget} pixels of the runway's image have no lit pixel{near}.",
-    ]
-    if tolerance.extra_budget >= 0:
-        lines.append(f"At most {tolerance.extra_budget} lit pixels of the true cell's spatial mask are not the runway's{near}.")
-    return lines
-
-
 def _serialised(graph: onnx.GraphProto, metadata: dict[str, Any]) -> bytes:
     """The model file: graph, versions and metadata with their digest, checked by onnx."""
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, producer_name="glideproof")
@@ -350,17 +242,3 @@ def _serialised(graph: onnx.GraphProto, metadata: dict[str, Any]) -> bytes:
     helper.set_model_props(model, {METADATA_KEY: json.dumps(signed, sort_keys=True)})
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString(deterministic=True)
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Writes beside `path` and renames, so that what lay there before stays whole until the new file is."""
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with part.open("wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)

@@ -1,6 +1,6 @@
 """NN_F as a static ONNX graph of standard operators, without control flow.
 
-Markings are steep, so a mask is a few vertical runs (`build_model.pixel_mask`): with the sums of the frame down its columns, a run is
+Markings are steep, so a mask is a few vertical runs (`build_model.run_table`): with the sums of the frame down its columns, a run is
 counted by two look-ups, and a mask's score is the same affine map of the frame as the matrix product it replaces, at a fraction of
 its weights. The union of the passing cells' S is painted by the transpose of that map: 1 and -1 at the ends of the runs, summed down the
 columns. Where a cell's entries fill several rows, what the rows give is gathered by cell and reduced again.
@@ -18,16 +18,10 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from build_model.filter_network import FilterTables
-from runtime.rounding import float32_above, float32_below
+from build_model.filter_tables import FilterTables
+from runtime.model.format import BUDGETS, FRAME, LINE_BOX_TENSORS
 from runtime.scene import STATE_NAMES, Scene
 
-OPSET = 20
-IR_VERSION = 10
-BUDGETS = ("missed_budget", "extra_budget")
-
-LINE_BOXES = ("line_lower", "line_upper", "reference_row")
-"""Initialisers that no node reads: the entries' boxes, which say what the masks claim."""
 BIT = np.int8
 """Weights of a product of bytes; those of the frame are unsigned, and this is the pair that processors have instructions for."""
 
@@ -62,12 +56,12 @@ def filter_graph(scene: Scene, tables: FilterTables) -> onnx.GraphProto:
     missed, extra = _scores(g, tables, _lit(g, tables, sums))
     _decide(g, scene, tables, missed, extra)
     _filtered(g, scene, tables, crop)
-    for name in LINE_BOXES:
+    for name in LINE_BOX_TENSORS:
         g.constant(name, getattr(tables, name))
     for name in BUDGETS:
         g.constant(name, np.array(getattr(scene.tolerance, name), dtype=np.int32))
     cells = len(tables.cells)
-    inputs = [helper.make_tensor_value_info("frame", TensorProto.UINT8, scene.camera.shape)]
+    inputs = [helper.make_tensor_value_info(FRAME, TensorProto.UINT8, scene.camera.shape)]
     inputs += [helper.make_tensor_value_info(name, TensorProto.INT32, []) for name in BUDGETS]
     outputs = [
         helper.make_tensor_value_info("cell", TensorProto.INT64, []),
@@ -89,7 +83,7 @@ def _column_sums(g: GraphWriter, scene: Scene, tables: FilterTables) -> tuple[st
     g.whole("row_of_zeros", 1, 0, 0, 0)
     g.constant("down", np.array(0, dtype=np.int64))
     g.whole("flat", -1)
-    crop = g.node("Slice", "crop", "frame", first, stop, "rows_and_columns")
+    crop = g.node("Slice", "crop", FRAME, first, stop, "rows_and_columns")
     if tables.runs.folded:
         g.constant("fold", np.concatenate([half := np.eye(tables.runs.columns, dtype=BIT), half[::-1]]))
     sums = _sums(g, "frame", tables, crop)
@@ -169,8 +163,8 @@ def _decide(g: GraphWriter, scene: Scene, tables: FilterTables, missed: str, ext
     g.node("Where", "cell", "some_pass", best, g.node("ArgMin", "least_mismatch", "mismatch", axis=0, keepdims=0))
     fails = g.node("Cast", "fails_counted", g.node("Not", "fails", passes), to=TensorProto.FLOAT)
     g.node("Mul", "removed_by", fails, g.constant("farthest", np.finfo(np.float32).max))
-    _hull(g, scene, tables, "lower", float32_below(tables.cells.lower), "Add", "ReduceMin")
-    _hull(g, scene, tables, "upper", float32_above(tables.cells.upper), "Sub", "ReduceMax")
+    _hull(g, scene, tables, "lower", tables.cell_lower, "Add", "ReduceMin")
+    _hull(g, scene, tables, "upper", tables.cell_upper, "Sub", "ReduceMax")
 
 
 def _support(g: GraphWriter, tables: FilterTables, passes: str) -> None:

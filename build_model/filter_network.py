@@ -1,15 +1,12 @@
-"""NN_F, the filter of all cells (paper, section III.D): its tables, and a torch module that evaluates it as it is defined.
+"""NN_F, the filter of all cells (paper, section III.D), in torch as it is defined.
 
-`FilterTables` lays the cells' banks out in rows of one width, ready for the static graph of `build_model.filter_graph`: a row for a cell
-where the cells have about as many entries each, several rows for the larger ones where they have not. `FilterNetwork` evaluates S, K
-and O as dense 0/1 weights instead: spatial masks by elementwise products, banks by integer matrix products, an argmax over the cells. The
-two share no index, so that their parity is a test of both.
+S, K and O are evaluated as dense 0/1 weights: spatial masks by elementwise products, banks by integer matrix products, an argmax over the
+cells. The static graph of `build_model.filter_graph` shares no index with it, so that their parity is a test of both.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -17,100 +14,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from build_model.hough_bank import CellBank
-from build_model.partition import Partition, partition
-from build_model.pixel_mask import Window
-from build_model.run_table import RunTable, SpatialRuns, run_table, spatial_runs
+from build_model.partition import partition
 from runtime.rounding import float32_above, float32_below
 from runtime.scene import Scene
-
-NEVER = 2**20
-"""|K| of the padding: more than any frame can light, so that padding never passes and is never the least mismatch."""
-ROW_COST, SECOND_REDUCTION_COST = 8, 2000
-"""What a row costs beside its entries, and what it costs to gather rows by cell and reduce them again, in entries scored and reduced."""
-
-
-@dataclass(frozen=True)
-class FilterTables:
-    """Constants of NN_F. A cell's entries fill one row or several, (rows, width), the last of them padded."""
-
-    window: Window
-    cells: Partition
-    row_cell: NDArray[np.int32]
-    """The cell of each row, (rows,), ascending."""
-    runs: RunTable
-    spatial_runs: SpatialRuns
-    must_light_size: NDArray[np.int32]
-    """|K_ij|, (rows, width); `NEVER` in the padding."""
-    state_lower: NDArray[np.float32]
-    state_upper: NDArray[np.float32]
-    """Each entry in state coordinates, (rows, width, 4)."""
-    line_lower: NDArray[np.float64]
-    line_upper: NDArray[np.float64]
-    """Each entry's box in theta, x, scale, z, (rows, width, 4): what a verifier must prove the masks for."""
-    reference_row: NDArray[np.float64]
-    """The row of the frame that each entry's scale refers to, (rows, width) px."""
-
-    @property
-    def rows_of_cell(self) -> NDArray[np.int32]:
-        """Every cell's rows, (rows of the largest cell, cells); a smaller cell's last one again where it has no more."""
-        first, last = (np.searchsorted(self.row_cell, np.arange(len(self.cells)), side) for side in ("left", "right"))
-        return np.minimum(first + np.arange((last - first).max())[:, None], last - 1).astype(np.int32)
-
-    @property
-    def smallest_must_light(self) -> int:
-        """Smallest |K_ij| of all entries."""
-        return int(self.must_light_size.min())
-
-
-def assemble(scene: Scene, banks: Sequence[CellBank]) -> FilterTables:
-    """Lays out the banks of all cells, in the order of the partition."""
-    window = banks[0].window
-    for bank in banks[1:]:
-        window = window.union(bank.window)
-    entries = [len(bank) for bank in banks]
-    width = row_width(entries)
-    rows = rows_filled(entries, width)
-
-    def padded(parts: Iterable[NDArray], padding: int = 0) -> NDArray:
-        fitted = [
-            np.pad(part, [(0, count * width - len(part))] + [(0, 0)] * (part.ndim - 1), constant_values=padding)
-            for part, count in zip(parts, rows, strict=True)
-        ]
-        return np.concatenate(fitted).reshape(-1, width, *fitted[0].shape[1:])
-
-    return FilterTables(
-        window=window,
-        cells=partition(scene),
-        row_cell=np.repeat(np.arange(len(banks), dtype=np.int32), rows),
-        runs=run_table(banks, window, scene.tolerance.line_px > 0, width),
-        spatial_runs=spatial_runs(banks, window),
-        must_light_size=padded((bank.must_light_sizes for bank in banks), NEVER).astype(np.int32),
-        state_lower=padded(bank.state_lower for bank in banks),
-        state_upper=padded(bank.state_upper for bank in banks),
-        line_lower=padded(bank.lines.lower for bank in banks),
-        line_upper=padded(bank.lines.upper for bank in banks),
-        reference_row=padded(bank.lines.reference_row for bank in banks),
-    )
-
-
-def rows_filled(entries: Sequence[int], width: int) -> NDArray[np.int64]:
-    """Rows of that width which each cell's entries take."""
-    return -(-np.asarray(entries) // width)
-
-
-def row_width(entries: Sequence[int]) -> int:
-    """The width of rows that makes a frame cheapest: every place in a row is scored and reduced, padding too.
-
-    One row a cell needs no second reduction; a narrower one has less padding where cells have unlike numbers of entries.
-    """
-
-    def cost(width: int) -> float:
-        rows = rows_filled(entries, width)
-        again = SECOND_REDUCTION_COST + len(entries) * rows.max() if rows.max() > 1 else 0
-        return float(rows.sum() * (width + ROW_COST) + again)
-
-    most = max(entries)
-    return min(dict.fromkeys(-(-most // parts) for parts in range(1, most + 1)), key=cost)
 
 
 class FilterNetwork(nn.Module):

@@ -21,8 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from build_model.enclosure import columns_that_may_be_lit, columns_that_must_be_lit
-from build_model.pixel_mask import Bits, Runs, Window, inset, paint, runs_of, widened
+from build_model.pixel_mask import Runs, inset, paint, runs_of, widened
 from build_model.spatial_filter import reference_row, sliced, spatial_filter
+from build_model.window import Bits, Window
 from runtime.rounding import float32_above, float32_below, inverted
 from runtime.scene import STATE_NAMES, Camera, Scene, SceneError
 from runtime.state_set import StateSet, contract, scale_range, tangent_of_row

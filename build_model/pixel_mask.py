@@ -1,7 +1,7 @@
 """Sets of pixels: from columns a row to bits in a window, and from bits to runs.
 
 A marking that is steeper than 45 degrees in the image covers each column in a single run of rows, and a mask is a few such runs.
-With sums of the frame down its columns, a mask's lit pixels are counted by two look-ups a run (`build_model.filter_network`).
+With sums of the frame down its columns, a mask's lit pixels are counted by two look-ups a run (`build_model.run_table`).
 """
 
 from __future__ import annotations
@@ -13,33 +13,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from build_model.enclosure import Columns
+from build_model.window import Bits, Window
 from runtime.scene import Scene
-
-Bits = NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class Window:
-    """A rectangle of the frame: rows [top, bottom) and columns [left, right)."""
-
-    top: int
-    bottom: int
-    left: int
-    right: int
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(rows, columns)."""
-        return self.bottom - self.top, self.right - self.left
-
-    @property
-    def slices(self) -> tuple[slice, slice]:
-        """Selects the window from a frame."""
-        return slice(self.top, self.bottom), slice(self.left, self.right)
-
-    def union(self, other: Window) -> Window:
-        """The smallest window that holds both."""
-        return Window(min(self.top, other.top), max(self.bottom, other.bottom), min(self.left, other.left), max(self.right, other.right))
 
 
 @dataclass(frozen=True)

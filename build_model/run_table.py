@@ -10,53 +10,17 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from build_model.filter_tables import RunTable, SpatialRuns
 from build_model.hough_bank import CellBank
-from build_model.pixel_mask import Runs, Window
+from build_model.pixel_mask import Runs
+from build_model.window import Window
 
 BLOCK_COST = 2500
 """What a further block costs, in runs: its nodes take as long as it takes to count this many."""
-
-
-@dataclass(frozen=True)
-class RunTable:
-    """All masks, sorted by their number of runs, most first.
-
-    A block (2, runs, masks) int32 adds that many runs to each of the first `masks` masks: the lit pixels of the mask at place p are the
-    sum, over all blocks that reach it and over k, of sums[block[0, k, p]] - sums[block[1, k, p]]. The sums are (rows + 1, `columns`),
-    flat: down the columns of the window, or of the window folded along its middle. With a tolerance the sums of the dilated frame follow,
-    which K is counted in. Unused runs are (0, 0).
-    """
-
-    blocks: tuple[NDArray[np.int32], ...]
-    columns: int
-    folded: bool
-    spatial: NDArray[np.int32]
-    """The place of S_i, (cells,)."""
-    must_light: NDArray[np.int32]
-    """The place of K_ij, (rows, width) as in `FilterTables`; that of another mask of the cell in the padding."""
-    may_light: NDArray[np.int32]
-    """The place of O_ij, likewise."""
-
-    @property
-    def look_ups(self) -> int:
-        """Sums that are looked up in a frame."""
-        return sum(block.size for block in self.blocks)
-
-
-@dataclass(frozen=True)
-class SpatialRuns:
-    """Where the runs of all S_i start and stop, to paint them, (ends,) each."""
-
-    cell: NDArray[np.int32]
-    index: NDArray[np.int32]
-    """The first pixel of a run, or the first one below it, flat in the window. A run down to the last row has no stop."""
-    step: NDArray[np.int32]
-    """1 at a start, -1 at a stop."""
 
 
 def run_table(banks: Sequence[CellBank], window: Window, dilated: bool, width: int) -> RunTable:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from build_model.enclosure import columns_that_may_be_lit
 from build_model.partition import partition
-from build_model.pixel_mask import Bits, Window, paint, widened, window_of
+from build_model.pixel_mask import paint, widened, window_of
+from build_model.window import Bits, Window
 from runtime.camera import row_of_point
 from runtime.scene import Camera, Scene, SceneError
 from runtime.state_set import StateSet, contract, scale_range, tangent_of_row

@@ -25,8 +25,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from build_model.partition import partition
-from build_model.pixel_mask import Window
 from build_model.spatial_filter import spatial_filter
+from build_model.window import Window
 from runtime.camera import project
 from runtime.image import image_of_ends
 from runtime.scene import STATE_NAMES, STATE_UNITS, Scene

@@ -6,9 +6,10 @@
 Conventions: `runtime.camera`. What is guaranteed: `runtime.estimator` and docs/guarantee.md.
 """
 
-from runtime.estimator import Box, Estimate, Estimator, FrameError, Outcome
+from runtime.estimate import Box, Estimate, FrameError, Outcome
+from runtime.estimator import Estimator
 from runtime.frames import EventError, FrameStream, events_to_frames
-from runtime.model.model_file import ModelError
+from runtime.model.format import ModelError
 from runtime.scene import Scene, SceneError
 
 __all__ = [

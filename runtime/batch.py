@@ -12,30 +12,31 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.estimator import Estimate, Estimator
+from runtime.estimate import Estimate
 
 Frame = NDArray[np.uint8]
+Estimates = Callable[[Frame], Estimate]
+"""What makes an estimate of a frame that fits the model."""
 CHUNK = 8
 """Frames that a worker is given at once."""
-_estimator: Estimator
-"""The model of a process that `by_processes` has started."""
+_estimate: Estimates
+"""What a process that `by_processes` has started makes of a frame."""
 
 
-def by_threads(estimator: Estimator, frames: Iterable[Frame], workers: int) -> Iterator[Estimate]:
-    """Estimates without refinement of frames that fit the model."""
+def by_threads(estimate: Estimates, frames: Iterable[Frame], workers: int) -> Iterator[Estimate]:
+    """What `estimate` makes of the frames, on `workers` threads."""
     with ThreadPoolExecutor(workers) as pool:
-        yield from _in_order(frames, workers, lambda chunk: pool.submit(_estimate_each, estimator, chunk, False))
+        yield from _in_order(frames, workers, lambda chunk: pool.submit(_estimate_each, estimate, chunk))
 
 
-def by_processes(model: dict[str, Any], width: int, frames: Iterable[Frame], workers: int) -> Iterator[Estimate]:
-    """Refined estimates of frames of that width which fit the model; each process loads it by `Estimator.load(**model)`."""
+def by_processes(load: Callable[[], Estimates], width: int, frames: Iterable[Frame], workers: int) -> Iterator[Estimate]:
+    """What `load()`, called once in each of `workers` processes, makes of frames of that width. `load` is sent there by pickle."""
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, context, initializer=_load, initargs=(model,)) as pool:
+    with ProcessPoolExecutor(workers, context, initializer=_load, initargs=(load,)) as pool:
         for estimate in _in_order(frames, workers, lambda chunk: pool.submit(_estimate_bits, np.packbits(chunk, axis=-1), width)):
             yield replace(estimate, filtered=np.unpackbits(estimate.filtered, axis=-1, count=width))
 
@@ -51,15 +52,15 @@ def _in_order(frames: Iterable[Frame], workers: int, submit: Callable[[list[Fram
         yield from started.popleft().result()
 
 
-def _estimate_each(estimator: Estimator, frames: Iterable[Frame], refine: bool) -> list[Estimate]:
-    return [estimator.estimate(frame, refine=refine) for frame in frames]
+def _estimate_each(estimate: Estimates, frames: Iterable[Frame]) -> list[Estimate]:
+    return [estimate(frame) for frame in frames]
 
 
-def _load(model: dict[str, Any]) -> None:
-    global _estimator
-    _estimator = Estimator.load(**model)
+def _load(load: Callable[[], Estimates]) -> None:
+    global _estimate
+    _estimate = load()
 
 
 def _estimate_bits(bits: NDArray[np.uint8], width: int) -> list[Estimate]:
-    estimates = _estimate_each(_estimator, np.unpackbits(bits, axis=-1, count=width), refine=True)
+    estimates = _estimate_each(_estimate, np.unpackbits(bits, axis=-1, count=width))
     return [replace(estimate, filtered=np.packbits(estimate.filtered, axis=-1)) for estimate in estimates]

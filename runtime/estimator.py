@@ -9,108 +9,29 @@ lies in the scene's domain, the camera is the scene's (no roll or yaw, the calib
 
 from __future__ import annotations
 
-import enum
 import hashlib
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from runtime.image import dilated
-from runtime.model.entries import BOX_TENSORS, MASK_TENSORS, Entries
-from runtime.model.model_file import ModelError, ModelFile, packaged_model, parse_model, read_model
-from runtime.model.session import OUTPUTS, check_interface, open_session, reason_of
-from runtime.refine import Refiner, connected_parts, joined
+from runtime.estimate import Box, Estimate, FrameError, Outcome
+from runtime.model.entries import Entries
+from runtime.model.format import BOX_TENSORS, MASK_TENSORS, OUTPUTS, ModelError
+from runtime.model.model_file import ModelFile, packaged_model, parse_model, read_model
+from runtime.model.session import check_interface, open_session, reason_of
+from runtime.refine.refiner import Refiner
+from runtime.refine.regions import hulls, regions_of
+from runtime.refine.theorem_b import refined_by_cell
+from runtime.refine.witnesses import witnesses
 from runtime.scene import STATE_NAMES, Scene, SceneError
 from runtime.state_set import StateSet
 
 REFINED_BEYOND_PX = 2
 """How far beyond the spatial masks the refinement looks at pixels; those farther out it takes for lit."""
-
-
-class FrameError(ValueError):
-    """A frame that the model cannot take."""
-
-    def __init__(self, actual: str, expected: str) -> None:
-        super().__init__(f"frame: found {actual}, expected {expected}")
-        self.actual = actual
-        self.expected = expected
-
-
-class Outcome(enum.Enum):
-    """What a frame says: CERTIFIED, a box is given; NO_RUNWAY, no state of the domain is consistent with it."""
-
-    CERTIFIED = "certified"
-    NO_RUNWAY = "no runway"
-
-
-@dataclass(frozen=True)
-class Box:
-    """Certified: the state lies between `lower` and `upper`, (4,) float64 each, read-only, under the model's assumptions."""
-
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
-
-    def __post_init__(self) -> None:
-        for name in ("lower", "upper"):
-            side = np.array(getattr(self, name), dtype=np.float64)
-            side.flags.writeable = False
-            object.__setattr__(self, name, side)
-        if self.lower.shape != (4,) or not (np.isfinite(self.lower) & np.isfinite(self.upper) & (self.lower <= self.upper)).all():
-            raise ValueError(f"box: found lower {self.lower} and upper {self.upper}, expected four finite ordered bounds")
-
-    def __reduce__(self) -> tuple[type[Box], tuple[NDArray[np.float64], NDArray[np.float64]]]:
-        return Box, (self.lower, self.upper)  # a copy from another process is checked and read-only too
-
-    @property
-    def centre(self) -> NDArray[np.float64]:
-        """Middle of the box, (4,); exact on an axis of width 0."""
-        return np.clip((self.lower + self.upper) / 2, self.lower, self.upper)
-
-    @property
-    def half_widths(self) -> NDArray[np.float64]:
-        """Half of the box's extent, (4,)."""
-        return (self.upper - self.lower) / 2
-
-    def contains(self, state: ArrayLike) -> bool:
-        """True if a state (4,) lies in the box, borders included; False if it has a NaN."""
-        point = np.asarray(state, dtype=np.float64)
-        return bool(((self.lower <= point) & (point <= self.upper)).all())
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """What one frame tells. States are [theta, x, y, z] in rad and m (`runtime.camera`)."""
-
-    outcome: Outcome
-    box: Box | None
-    """Certified; None where nothing is."""
-    state: NDArray[np.float64] | None
-    """The proposal if it lies in the box, else the box's centre; None where nothing is certified."""
-    used_fallback: bool
-    """True if the centre was taken."""
-    network_state: NDArray[np.float64]
-    """NN_e's answer, uncertified."""
-    cell: int
-    """The cell with the most consistent entries, or with the smallest mismatch where none is consistent."""
-    passing: NDArray[np.int64]
-    """Numbers of the cells that are consistent with the frame."""
-    mismatch: int
-    """Smallest missed + extra of `cell`."""
-    filtered: NDArray[np.uint8]
-    """The frame within the spatial masks of the passing cells: keeps every lit pixel of the runway."""
-    regions: tuple[Box, ...]
-    """Connected parts of what is consistent, each in its box; more than one is an ambiguity. One without refinement."""
-    touches_boundary: bool
-    """The box reaches a face of the domain: it holds the state only if the aircraft is in the domain."""
-
-    @property
-    def certified(self) -> bool:
-        """True if a box is given."""
-        return self.outcome is Outcome.CERTIFIED
 
 
 class Estimator:
@@ -129,8 +50,8 @@ class Estimator:
             raise ModelError(f"{name}: its metadata misstate the smallest |K| of its entries; export it again with export-model")
         self._session = open_session(model.content, name, threads)
         check_interface(self._session, self.scene, model.tensors["must_light_size"].shape, name)
-        self._domain_lower, self._domain_upper = self.scene.domain.lower, self.scene.domain.upper
-        self._fixed = self._domain_lower == self._domain_upper
+        self._domain = Box(self.scene.domain.lower, self.scene.domain.upper)
+        self._fixed = self._domain.lower == self._domain.upper
         window = self._entries.window_and_beyond(REFINED_BEYOND_PX)
         self._refiner = Refiner(self.scene, int(self._budgets["missed_budget"]), int(self._budgets["extra_budget"]), window)
         self._arguments = {"path": name, "missed_budget": missed_budget, "extra_budget": extra_budget, "sha256": self.sha256}
@@ -182,12 +103,12 @@ class Estimator:
         pixels = self._checked_frame(frame)
         outputs = self.run_unchecked(pixels)
         cell, support, mismatch, passes, cell_lower, cell_upper, filtered, network_state = outputs.values()
-        network = np.where(self._fixed, self._domain_lower, network_state)
+        network = np.where(self._fixed, self._domain.lower, network_state)
         passing = np.flatnonzero(support)
         if refine and len(passing):
-            regions = self._regions(self._refined(pixels.view(np.bool_), passes))
+            regions = regions_of(self._refined(pixels.view(np.bool_), passes), self._domain)
         else:
-            regions = self._hulls(cell_lower[passing], cell_upper[passing], [np.arange(len(passing))] if len(passing) else [])
+            regions = hulls(cell_lower[passing], cell_upper[passing], [np.arange(len(passing))] if len(passing) else [], self._domain)
         box = Box(np.min([part.lower for part in regions], axis=0), np.max([part.upper for part in regions], axis=0)) if regions else None
         state, used_fallback = self._shielded(box, network if proposal is None else self._checked_proposal(proposal))
         return Estimate(
@@ -216,49 +137,19 @@ class Estimator:
 
         pixels = map(self._checked_frame, frames)
         if refine:
-            return by_processes(self._arguments, self.scene.camera.width, pixels, processes)
-        return by_threads(self, pixels, processes)
+            return by_processes(partial(_loaded, self._arguments), self.scene.camera.width, pixels, processes)
+        return by_threads(partial(self.estimate, refine=False), pixels, processes)
 
     def spatial_mask(self, cell: int) -> NDArray[np.bool_]:
         """S of a cell, (height, width): every pixel that one of its states can light, widened by the tolerance."""
         return self._entries.within(cell, np.ones(self.scene.camera.shape, dtype=np.bool_))
 
     def _refined(self, frame: NDArray[np.bool_], passes: NDArray[np.bool_]) -> StateSet:
-        """What is left of the passing entries. Theorem B's claims, which differ from cell to cell, are made at tolerance 0 only."""
-        witnesses = self._witnesses(frame)
-        if self._refiner.extra_budget < 0 or self.scene.tolerance.line_px > 0:
-            return self._refiner.refine(witnesses, self._entries.sets(passes))
-        row_cell = self._entries.row_cell
-        cells = np.unique(row_cell[passes.any(axis=1)])
-        alone = row_cell[:, None]
-        return joined(
-            *(
-                self._refiner.refine(witnesses, self._entries.sets(passes & (alone == cell)), self._entries.within(int(cell), frame))
-                for cell in cells
-            )
-        )
-
-    def _witnesses(self, frame: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Lit where a lit pixel lies within `line_px` in the sup norm, or the frame ends: what belongs there may be seen outside of it."""
-        radius = self.scene.tolerance.line_px
-        if radius == 0:
-            return frame
-        wide = dilated(np.pad(frame, radius, constant_values=True), radius)
-        return wide[radius : radius + len(frame), radius : radius + frame.shape[1]]
-
-    def _regions(self, pieces: StateSet) -> tuple[Box, ...]:
-        """Boxes of the connected parts of the pieces."""
-        return self._hulls(pieces.lower, pieces.upper, connected_parts(pieces))
-
-    def _hulls(self, lower: NDArray, upper: NDArray, parts: list[NDArray[np.int64]]) -> tuple[Box, ...]:
-        """The box of each part, within the domain, which holds the state by assumption."""
-        return tuple(
-            Box(
-                np.clip(lower[part].min(axis=0).astype(np.float64), self._domain_lower, self._domain_upper),
-                np.clip(upper[part].max(axis=0).astype(np.float64), self._domain_lower, self._domain_upper),
-            )
-            for part in parts
-        )
+        """What is left of the passing entries. Theorem B's claims are made at tolerance 0 only."""
+        line_px = self.scene.tolerance.line_px
+        if self._refiner.extra_budget >= 0 and line_px == 0:
+            return refined_by_cell(self._refiner, self._entries, passes, frame)
+        return self._refiner.refine(witnesses(frame, line_px), self._entries.sets(passes))
 
     @staticmethod
     def _shielded(box: Box | None, proposal: NDArray[np.float64]) -> tuple[NDArray[np.float64] | None, bool]:
@@ -268,7 +159,7 @@ class Estimator:
         return (proposal, False) if box.contains(proposal) else (box.centre, True)
 
     def _touches_boundary(self, box: Box) -> bool:
-        touches = (box.lower <= self._domain_lower) | (box.upper >= self._domain_upper)
+        touches = (box.lower <= self._domain.lower) | (box.upper >= self._domain.upper)
         return bool((touches & ~self._fixed).any())
 
     def _checked_frame(self, frame: NDArray) -> NDArray[np.uint8]:
@@ -302,3 +193,8 @@ class Estimator:
         if not -1 <= extra < 2**31:
             raise ModelError(f"{name}: extra_budget {extra}: must be 0 or more, or -1 for not used")
         return {"missed_budget": np.array(missed, dtype=np.int32), "extra_budget": np.array(extra, dtype=np.int32)}
+
+
+def _loaded(arguments: dict[str, Any]) -> Callable[[NDArray[np.uint8]], Estimate]:
+    """`estimate` of the model that these arguments of `load` give, for another process."""
+    return Estimator.load(**arguments).estimate

@@ -45,6 +45,7 @@ from rich.progress import track
 from rich.table import Table
 
 from runtime import Estimator, ModelError, Scene
+from runtime.errors import fail
 from runtime.image import lit_columns
 from runtime.rounding import above, below
 
@@ -404,8 +405,7 @@ def main(
         estimator = Estimator.load(model)
         inversion = SetInversion(estimator.scene)
     except (ModelError, ValueError) as error:
-        errors.print(str(error), markup=False, soft_wrap=True)
-        raise typer.Exit(2) from error
+        fail(error)
     size = precision * TYPICAL_HALF_WIDTHS
     results = []
     for density in clutter or [0.0, 0.02]:

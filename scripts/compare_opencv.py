@@ -44,6 +44,7 @@ from rich.table import Table
 
 from runtime import Estimator, ModelError, Scene
 from runtime.camera import ground_scale, project, row_of_point
+from runtime.errors import fail
 
 Floats = NDArray[np.float64]
 Frame = NDArray[np.uint8]
@@ -374,8 +375,7 @@ def main(
         estimator = Estimator.load(model)
         baseline = Baseline(estimator.scene)
     except (ModelError, ValueError) as error:
-        errors.print(str(error), markup=False, soft_wrap=True)
-        raise typer.Exit(2) from error
+        fail(error)
     answers: list[Answer] = []
     for density in clutter or [0.0, 0.02, 0.05]:
         drawn = draw_frames(estimator.scene, frames, density, seed)

@@ -26,9 +26,11 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from build_model.paper.reachability import Method, possible_pixels
+from build_model.paper.bounds import Method
+from build_model.paper.reachability import possible_pixels
 from build_model.partition import partition
 from build_model.spatial_filter import spatial_filters
+from runtime.errors import fail
 from runtime.image import lit_columns
 from runtime.scene import Scene, SceneError
 
@@ -106,8 +108,7 @@ def main(
         with Progress(console=errors, transient=True) as progress:
             counts = compare(Scene.load(scene_path), samples, seed, whole_frame=whole_frame, progress=progress)
     except (SceneError, ValueError) as error:
-        errors.print(str(error), markup=False, soft_wrap=True)
-        raise typer.Exit(2) from error
+        fail(error)
     Console().print(table_of(counts))
 
 

@@ -34,7 +34,6 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from fly_approach import write_whole
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
@@ -43,11 +42,13 @@ from simulate_approach import PAPER_SECONDS, WINDOW_US, Target, Vibration, event
 
 from build_model.calibration import displacement_px
 from build_model.export import build_banks
-from build_model.pixel_mask import Window
+from build_model.window import Window
 from runtime import Scene, SceneError
+from runtime.errors import fail
 from runtime.frames import FrameStream
 from runtime.image import dilated, runway_image
 from runtime.scene import Bank, Marking, Runway, Tolerance
+from runtime.whole_file import write_whole
 
 FIRST_SEED = 1000
 TOLERANCES_PX = (0, 1, 2)
@@ -186,11 +187,9 @@ def main(
     try:
         text = derive(Scene.load(scene), flights, seconds, share, console)
     except (SceneError, ValueError, OSError) as error:
-        print(" ".join(str(error).split()), file=sys.stderr)
-        raise typer.Exit(2) from None
+        fail(error)
     if text is None:
-        print("no tolerance of 0 to 2 px leaves every entry of the bank a pixel more than the budget; lower --share", file=sys.stderr)
-        raise typer.Exit(2)
+        fail("no tolerance of 0 to 2 px leaves every entry of the bank a pixel more than the budget; lower --share")
     write_whole(output, text.encode())
     console.print(f"written: {output}", markup=False)
 

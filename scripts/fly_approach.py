@@ -13,8 +13,6 @@ from __future__ import annotations
 import csv
 import io
 import itertools
-import os
-import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -23,6 +21,7 @@ from typing import Annotated
 
 import numpy as np
 import typer
+from approach import approach_states
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
@@ -30,21 +29,18 @@ from rich.table import Table
 
 from build_model.spatial_filter import spatial_filters
 from runtime import Estimate, Estimator, ModelError, Scene
+from runtime.errors import fail
 from runtime.frames import FrameStream
 from runtime.image import runway_image
-from runtime.recordings.draw import Picture, contact_sheet, draw_estimate, draw_runway
+from runtime.recordings.draw import contact_sheet, draw_estimate, draw_runway, png
 from runtime.recordings.recording import RecordingError, read_events
 from runtime.scene import STATE_NAMES, STATE_UNITS
+from runtime.whole_file import write_whole
 
 WINDOW_US = 40_000
-FACE_MARGIN = 0.02
-"""Share of the domain's width that the approach keeps from its faces, on every axis."""
-SWING = 0.9
-"""Amplitude of pitch and of lateral position, as a share of what that margin leaves."""
-PITCH_PERIODS = 1.5
 PICTURES = 10
 NARROWEST_TABLE = 150
-UNSAFE, USER_ERROR = 1, 2
+UNSAFE = 1
 BUILT_MODEL = Path("out/paper.onnx")
 
 Frames = Iterator[NDArray[np.uint8]]
@@ -69,16 +65,6 @@ class Step:
     def error(self) -> float:
         """2-norm of estimate minus truth, rad and m together as in the paper; NaN where nothing is certified."""
         return float("nan") if self.estimate.state is None else float(np.linalg.norm(self.estimate.state - self.truth))
-
-
-def approach_states(scene: Scene, count: int, phase_rad: float) -> NDArray[np.float64]:
-    """`count` states of a descent through the domain, (count, 4): y and z fall from one end of their range to the other."""
-    centre, half = (scene.domain.upper + scene.domain.lower) / 2, (scene.domain.upper - scene.domain.lower) / 2
-    along = np.linspace(0, 1, count)
-    pitch = SWING * np.sin(2 * np.pi * PITCH_PERIODS * along + phase_rad)
-    drift = SWING * np.sin(2 * np.pi * along)
-    height, distance = np.cos(np.pi * along), 1 - 2 * along
-    return centre + (1 - 2 * FACE_MARGIN) * half * np.stack([pitch, drift, height, distance], axis=-1)
 
 
 def clutter_frames(clutter: str, shape: tuple[int, int], count: int, rng: np.random.Generator, console: Console) -> Frames:
@@ -175,20 +161,6 @@ def csv_text(steps: Sequence[Step], lit_shares: Sequence[float]) -> str:
     return text.getvalue()
 
 
-def write_whole(path: Path, content: bytes) -> None:
-    """Writes beside `path` and renames: what was there stays until the new file is whole."""
-    part = path.with_name(f"{path.name}.part")
-    part.write_bytes(content)
-    os.replace(part, path)
-
-
-def png(picture: Picture) -> bytes:
-    """The picture as a PNG file."""
-    import cv2
-
-    return cv2.imencode(".png", picture)[1].tobytes()
-
-
 def run(model: Path | None, frames: int, clutter: str, out: Path, seed: int, console: Console) -> bool:
     """Flies, prints and writes; True if every certificate was kept. Raises `ModelError`, `RecordingError`, OSError."""
     estimator = Estimator.load(model, extra_budget=-1)
@@ -197,7 +169,6 @@ def run(model: Path | None, frames: int, clutter: str, out: Path, seed: int, con
     noise = clutter_frames(clutter, scene.camera.shape, frames, rng, console)
     masks = spatial_filters(scene)
     pictured = set(np.linspace(0, frames - 1, min(PICTURES, frames)).round().astype(int).tolist())
-    out.mkdir(parents=True, exist_ok=True)
     steps, lit_shares, small = [], [], []
     for step in track(fly(estimator, states, noise), "flying", total=frames, console=console, transient=True):
         lit_shares.append(float(step.frame.mean()))
@@ -234,8 +205,7 @@ def fly_approach(
     try:
         kept = run(model or (BUILT_MODEL if BUILT_MODEL.is_file() else None), frames, clutter, out, seed, console)
     except (ModelError, RecordingError, OSError) as error:
-        print(error, file=sys.stderr)
-        raise typer.Exit(USER_ERROR) from None
+        fail(error)
     if not kept:
         raise typer.Exit(UNSAFE)
 

@@ -21,6 +21,7 @@ import typer
 from numpy.typing import NDArray
 
 from runtime import Estimate, Estimator, ModelError
+from runtime.errors import fail
 from runtime.frames import EventError, FrameStream
 from runtime.recordings.recording import RecordingError, read_events
 from runtime.scene import STATE_NAMES
@@ -110,8 +111,7 @@ def main(
         stream = FrameStream(shape, round(window_ms * 1000), None if step_ms is None else round(step_ms * 1000))
         run(Replay(read_events(recording, shape), max(1, round(packet_ms * 1000)), speed), estimator, stream)
     except (ModelError, RecordingError, EventError) as error:
-        print(error, file=sys.stderr)
-        raise typer.Exit(2) from None
+        fail(error)
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ from typing import Annotated, Any
 import cv2
 import numpy as np
 import typer
-from fly_approach import approach_states, png, write_whole
+from approach import approach_states
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
@@ -35,8 +35,10 @@ from build_model.hough_bank import cell_bank
 from build_model.partition import partition
 from runtime import Estimate, Estimator, ModelError, Scene
 from runtime.camera import project
+from runtime.errors import fail
 from runtime.image import runway_image
-from runtime.recordings.draw import FILTERED, LINE_HEIGHT, STATE, History, Moment, Picture, colour_pixels, draw_history, draw_runway
+from runtime.recordings.draw import FILTERED, LINE_HEIGHT, STATE, History, Moment, Picture, colour_pixels, draw_history, draw_runway, png
+from runtime.whole_file import write_whole
 
 PAPER_MINUTES_A_CELL, PAPER_SECONDS_A_FRAME, PAPER_ERRORS, PAPER_FRAMES = 20, 37, (0.0777, 0.045), 1320
 TESTS = (1, 24)
@@ -56,7 +58,7 @@ LINE_PX = 4
 """Lines on the picture of the standard Hough's, seen on a telephone too."""
 CLOSE_UP = (160, 213)
 """Rows and columns around the runway that a filter's picture shows, magnified three times."""
-UNSAFE, USER_ERROR = 1, 2
+UNSAFE = 1
 
 Frame = NDArray[np.uint8]
 Rng = np.random.Generator
@@ -508,8 +510,7 @@ def main(
     try:
         kept = reproduce(model, frames, run or [], out, seed, console)
     except (ModelError, ValueError, OSError) as error:
-        print(" ".join(str(error).split()), file=sys.stderr)
-        raise typer.Exit(USER_ERROR) from None
+        fail(error)
     if not kept:
         raise typer.Exit(UNSAFE)
 

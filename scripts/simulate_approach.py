@@ -32,15 +32,17 @@ from typing import Annotated, Any
 import cv2
 import numpy as np
 import typer
-from fly_approach import approach_states, write_whole
+from approach import approach_states
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
 from runtime import Scene, SceneError
+from runtime.errors import fail
 from runtime.recordings.recording import EVENT
 from runtime.scene import STATE_NAMES, STATE_UNITS, Calibration
+from runtime.whole_file import replacing, write_whole
 
 WINDOW_US = 40_000
 STEP_US = 1_000
@@ -369,10 +371,9 @@ def write_raw(path: Path, events: NDArray[Any], shape: tuple[int, int]) -> None:
 
     packet = np.empty(len(events), dtype=faery.EVENTS_DTYPE)
     packet["t"], packet["x"], packet["y"], packet["on"] = events["t"], events["x"], events["y"], events["p"]
-    part = path.with_name(f"{path.stem}.part.raw")
     stream = faery.events_stream_from_array(packet, dimensions=(shape[1], shape[0]))
-    stream.to_file(part, version="evt3", zero_t0=False)
-    part.replace(path)
+    with replacing(path) as part:
+        stream.to_file(part, version="evt3", zero_t0=False)
 
 
 def simulate(scene: Scene, start_s: float, seconds: float, seed: int, out: Path, console: Console) -> None:
@@ -382,7 +383,6 @@ def simulate(scene: Scene, start_s: float, seconds: float, seed: int, out: Path,
     packets = list(track(camera.blocks(), "flying", total=count, console=console, transient=True))
     events = np.concatenate(packets)
     starts, states = window_truths(camera.flight, int(events["t"][0]))
-    out.mkdir(parents=True, exist_ok=True)
     write_raw(out / "approach.raw", events, scene.camera.shape)
     columns = io.BytesIO()
     np.savez_compressed(columns, t=events["t"], x=events["x"], y=events["y"], p=events["p"])
@@ -414,8 +414,7 @@ def main(
     try:
         simulate(Scene.load(scene), start, seconds, seed, out, console)
     except (SceneError, ValueError, OSError) as error:
-        print(" ".join(str(error).split()), file=sys.stderr)
-        raise typer.Exit(2) from None
+        fail(error)
 
 
 if __name__ == "__main__":

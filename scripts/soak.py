@@ -44,12 +44,13 @@ print(json.dumps({"seconds": seconds, "resident": memory, "more": resident() - m
 LOOP = """
 import os, sys
 import numpy
+sys.path.insert(0, sys.argv[4])
 from runtime import Estimator
-from runtime.recordings.bench import cluttered_frames
+from comparison_frames import draw_frames
 def resident():
     return int(open("/proc/self/statm").read().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 estimator, count, refine = Estimator.load(sys.argv[1]), int(sys.argv[2]), sys.argv[3] == "True"
-frames = [frame for seed, density in enumerate((0.0, 0.01, 0.02, 0.05)) for frame in cluttered_frames(estimator.scene, density, 25, seed)]
+frames = [frame for seed, density in enumerate((0.0, 0.01, 0.02, 0.05)) for _, frame in draw_frames(estimator.scene, 25, density, seed)]
 for frame in frames:
     estimator.estimate(frame, refine=refine)
 for number in range(count + 1):
@@ -68,7 +69,7 @@ def installed_bytes(distribution: str) -> int:
 def sizes(model: Path) -> dict[str, int]:
     """Bytes on disk of all that embedded use needs, Python apart."""
     runtime = Path(__file__).parents[1] / "runtime"
-    own = sum(path.stat().st_size for path in runtime.glob("*.py"))
+    own = sum(path.stat().st_size for path in runtime.rglob("*.py") if path.parent.name != "recordings")
     return {"runtime": own, "model": model.stat().st_size, **{name: installed_bytes(name) for name in ("onnxruntime", "numpy")}}
 
 
@@ -102,7 +103,7 @@ def main(
     table.add_row("resident with numpy and onnxruntime", f"{middle([start['resident'] for start in starts]) / MB:.1f} MB")
     table.add_row("more after the first estimate", f"{middle([start['more'] for start in starts]) / MB:.1f} MB")
     console.print(table)
-    command = [sys.executable, "-c", LOOP, str(model), str(frames), str(refine)]
+    command = [sys.executable, "-c", LOOP, str(model), str(frames), str(refine), str(Path(__file__).parent)]
     resident = []
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as loop:
         for line in loop.stdout or ():

@@ -14,7 +14,7 @@ import numpy as np
 import onnx
 import pytest
 
-from build_model.filter_network import row_width, rows_filled
+from build_model.assembly import row_width, rows_filled
 from runtime.estimator import Estimator
 from runtime.recordings.bench import (
     REFERENCE,
@@ -31,7 +31,7 @@ from runtime.recordings.bench import (
 )
 from runtime.scene import Scene
 
-COMMAND = [sys.executable, "-c", "from runtime.recordings.bench import bench_model_command; bench_model_command()"]
+COMMAND = [sys.executable, "-c", "from runtime.recordings.cli import bench_model_command; bench_model_command()"]
 HEADER = {"processor": "abacus", "opencv": "5"}
 
 

@@ -12,9 +12,9 @@ from distributed import Client, LocalCluster
 from scenes import PAPER
 
 from build_model import export
+from build_model.assembly import assemble
 from build_model.export import ClusterError, build_banks
 from build_model.filter_graph import filter_graph
-from build_model.filter_network import assemble
 from build_model.hough_bank import CellBank
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scenes import OFF_BY, PAPER, Floats
 
 from build_model.calibration import check_calibration, displacement_px
-from build_model.pixel_mask import Window
+from build_model.window import Window
 from runtime.scene import Calibration, SceneError, Tolerance
 
 WINDOW = Window(9, 316, 287, 353)

@@ -31,7 +31,7 @@ from rational_image import RationalState, RationalView, angle_is_at_least, lit_c
 
 from runtime.camera import project
 from runtime.image import runway_image
-from runtime.model.model_file import METADATA_KEY, metadata_digest
+from runtime.model.format import METADATA_KEY, metadata_digest
 from runtime.scene import Scene
 
 SPREAD = (PAPER, FREE_X, UNLIKE_MARKINGS, CUT_LEFT, CUT_BELOW)

@@ -18,14 +18,17 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 from scenes import OFF_BY, ONE_CELL, PAPER, SCENES
 
-from build_model.export import EstimatorError, assumptions, export_model, user_network, write_atomically
-from build_model.paper.reachability import paper_bound
+from build_model.assumptions import assumptions
+from build_model.export import export_model
+from build_model.paper.paper_bound import paper_bound
 from build_model.partition import partition
+from build_model.user_network import EstimatorError, user_network
 from runtime import Estimator
 from runtime.image import runway_image
-from runtime.model.model_file import METADATA_KEY
+from runtime.model.format import METADATA_KEY
 from runtime.rounding import OUTWARD_PX
 from runtime.scene import Scene, SceneError, Tolerance
+from runtime.whole_file import write_whole
 
 ModelOf = Callable[[str], Path]
 HEIGHT, WIDTH = ONE_CELL.camera.shape
@@ -150,10 +153,10 @@ def test_a_disk_that_is_full_leaves_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "model.onnx"
     path.write_bytes(b"old")
     with largest_file(10_000), pytest.raises(OSError, match="File too large"):
-        write_atomically(path, bytes(20_000))
+        write_whole(path, bytes(20_000))
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
-    write_atomically(path, b"new")
+    write_whole(path, b"new")
     assert path.read_bytes() == b"new"
 
 
@@ -185,14 +188,14 @@ def test_an_interrupt_leaves_the_old_model(tmp_path: Path, model_of: ModelOf, st
 
 
 def test_a_folder_is_made_and_a_folder_in_the_way_is_left(tmp_path: Path) -> None:
-    write_atomically(tmp_path / "new" / "folder" / "model.onnx", b"content")
+    write_whole(tmp_path / "new" / "folder" / "model.onnx", b"content")
     assert (tmp_path / "new" / "folder" / "model.onnx").read_bytes() == b"content"
     (tmp_path / "model.onnx").mkdir()
     with pytest.raises(IsADirectoryError):
-        write_atomically(tmp_path / "model.onnx", b"content")
+        write_whole(tmp_path / "model.onnx", b"content")
     assert {path.name for path in tmp_path.iterdir()} == {"new", "model.onnx"}
     with pytest.raises(NotADirectoryError):
-        write_atomically(tmp_path / "new" / "folder" / "model.onnx" / "more", b"content")
+        write_whole(tmp_path / "new" / "folder" / "model.onnx" / "more", b"content")
 
 
 # --- users' networks ---

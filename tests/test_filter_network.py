@@ -8,8 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scenes import SCENES
 
+from build_model.assembly import ROW_COST, SECOND_REDUCTION_COST, assemble, row_width
 from build_model.export import build_banks
-from build_model.filter_network import NEVER, ROW_COST, SECOND_REDUCTION_COST, assemble, row_width
+from runtime.model.format import PADDING_SIZE
 
 
 @given(st.lists(st.integers(1, 60), min_size=1, max_size=2000))
@@ -36,7 +37,7 @@ def test_like_numbers_of_entries_take_one_row_and_unlike_ones_several() -> None:
 
 @pytest.mark.parametrize("width", [4, 100])
 def test_rows_hold_each_cells_entries_in_order(monkeypatch: pytest.MonkeyPatch, width: int) -> None:
-    monkeypatch.setattr("build_model.filter_network.row_width", lambda _entries: width)
+    monkeypatch.setattr("build_model.assembly.row_width", lambda _entries: width)
     banks = build_banks(SCENES["cut left"])
     tables = assemble(SCENES["cut left"], banks)
     rows = tables.rows_of_cell
@@ -45,6 +46,6 @@ def test_rows_hold_each_cells_entries_in_order(monkeypatch: pytest.MonkeyPatch, 
         assert (np.unique(rows[:, cell]) == own).all()
         sizes = tables.must_light_size[own].ravel()
         assert sizes[: len(bank)].tolist() == bank.must_light_sizes.tolist()
-        assert (sizes[len(bank) :] == NEVER).all()
+        assert (sizes[len(bank) :] == PADDING_SIZE).all()
         assert (tables.line_lower[own].reshape(-1, 4)[: len(bank)] == bank.lines.lower).all()
         assert (tables.state_upper[own].reshape(-1, 4)[: len(bank)] == bank.state_upper).all()

@@ -18,19 +18,10 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper, numpy_helper
 
 from runtime.estimator import Estimator
-from runtime.model.entries import BOX_TENSORS
-from runtime.model.model_file import (
-    FORMAT_VERSION,
-    LARGEST_FIELDS,
-    LARGEST_FILE_BYTES,
-    LARGEST_METADATA_BYTES,
-    METADATA_KEY,
-    OPERATORS,
-    ModelError,
-    check_graph,
-    metadata_digest,
-    parse_model,
-)
+from runtime.model.format import BOX_TENSORS, FORMAT_VERSION, METADATA_KEY, ModelError, metadata_digest
+from runtime.model.model_file import LARGEST_FILE_BYTES, LARGEST_METADATA_BYTES, parse_model
+from runtime.model.onnx_subset import OPERATORS, check_graph
+from runtime.model.protobuf import LARGEST_FIELDS
 
 ModelOf = Callable[[str], Path]
 

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scenes import PAPER, examples
 
-from build_model.pixel_mask import Runs, Window, inset, paint, runs_of, widened, window_of
+from build_model.pixel_mask import Runs, inset, paint, runs_of, widened, window_of
+from build_model.window import Window
 from runtime.scene import Camera, Scene
 
 HEIGHT, WIDTH = 12, 16

@@ -16,25 +16,23 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 from scenes import examples
 
-from build_model.paper.reachability import (
-    Interval,
-    Method,
-    PaperBound,
-    layers,
+from build_model.paper.bounds import Method
+from build_model.paper.intervals import Interval
+from build_model.paper.mixed_monotonicity import mixed_monotone_bounds
+from build_model.paper.network_bounds import (
     linear_layer_by_intervals,
     linear_layer_range,
-    mixed_monotone_bounds,
     mixed_monotone_layers,
     network_upper_bounds,
-    paper_bound,
-    possible_pixels,
-    projection_jacobian,
     snap_outward,
-    zeta_bounds,
 )
+from build_model.paper.network_layers import layers
+from build_model.paper.paper_bound import PaperBound, paper_bound
+from build_model.paper.projection_bounds import projection_jacobian, zeta_bounds
+from build_model.paper.reachability import possible_pixels
 from build_model.paper.runway_network import RunwayNetwork, pixel_weights
 from build_model.partition import partition
-from build_model.pixel_mask import Window
+from build_model.window import Window
 from runtime.camera import project
 from runtime.image import runway_image
 from runtime.rounding import OUTWARD_PX

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -246,10 +247,14 @@ def test_after_ctrl_c_what_was_done_is_written(recording, tmp_path, monkeypatch)
     assert not list(tmp_path.glob("*.part*"))
 
 
-def test_without_opencv_one_line_says_what_to_install(recording, monkeypatch):
-    monkeypatch.setitem(sys.modules, "cv2", None)
-    done = invoke(MODEL, recording)
-    assert done.exit_code == 2
+def test_without_opencv_one_line_says_what_to_install(recording):
+    """In an interpreter of its own, as the installed command: an entry of None makes an import fail as if nothing were installed."""
+    program = "import sys; sys.modules['cv2'] = None; from runtime.recordings.cli import run_model_command; run_model_command()"
+    arguments = ["run-model", str(MODEL), str(recording)]
+    done = subprocess.run(
+        [sys.executable, "-c", f"import sys; sys.argv = {arguments!r}; {program}"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 2
     assert done.stderr.strip() == "run-model: the package 'cv2' is missing; pip install 'glideproof[recordings]'"
 
 

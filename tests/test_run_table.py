@@ -10,9 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from build_model.filter_tables import RunTable
 from build_model.hough_bank import CellBank, LineBoxes
-from build_model.pixel_mask import Runs, Window, runs_of
-from build_model.run_table import BLOCK_COST, RunTable, block_borders, mirrored, run_table, spatial_runs
+from build_model.pixel_mask import Runs, runs_of
+from build_model.run_table import BLOCK_COST, block_borders, mirrored, run_table, spatial_runs
+from build_model.window import Window
 
 Bits = NDArray[np.bool_]
 Frame = NDArray[np.uint8]

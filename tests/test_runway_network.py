@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from build_model.paper.runway_network import RunwayNetwork, phi_abs, phi_det, pixel_weights
-from build_model.pixel_mask import Window
+from build_model.window import Window
 from runtime.camera import project, project_points
 from runtime.image import runway_image
 from runtime.scene import Axis, Bank, Camera, Domain, Marking, Runway, Scene

@@ -18,7 +18,7 @@ import simulate_approach as simulator
 from rich.console import Console
 
 from build_model.calibration import check_calibration
-from build_model.pixel_mask import Window
+from build_model.window import Window
 from runtime.camera import project
 from runtime.frames import FrameStream
 from runtime.image import dilated, runway_image

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from scenes import BARELY_ABOVE, BARELY_BELOW, CUT_BELOW, CUT_LEFT, FREE_X, PAPER, SHIFTED, THREE_MARKINGS, Floats, tolerant
 
 from build_model.partition import partition
-from build_model.pixel_mask import Window
 from build_model.spatial_filter import reference_row, sliced, spatial_filter, spatial_filters
+from build_model.window import Window
 from runtime.camera import project, row_of_point
 from runtime.image import image_of_ends, lit_columns, runway_image
 from runtime.scene import Axis, Scene, SceneError

@@ -17,10 +17,9 @@ from rich.console import Console
 from rounding_bound import exact_state_and_bound
 from torch.nn import functional
 
+from build_model.assembly import assemble
 from build_model.export import build_banks, filter_function
-from build_model.filter_graph import OPSET, filter_graph
-from build_model.filter_network import assemble
-from build_model.pixel_mask import Window
+from build_model.filter_graph import filter_graph
 from build_model.spatial_filter import spatial_filters
 from build_model.state_network import (
     BLOCK_ROWS,
@@ -37,7 +36,9 @@ from build_model.state_network import (
     train_state_network,
     validation_error,
 )
+from build_model.window import Window
 from runtime.image import runway_image
+from runtime.model.format import OPSET
 from runtime.scene import Axis, Bank, Camera, Domain, EstimatorTraining, Marking, Runway, Scene
 
 Filter = Callable[[NDArray[np.uint8]], NDArray[np.uint8]]

@@ -22,19 +22,25 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 from typer.testing import CliRunner
 
+from build_model.assembly import assemble
 from build_model.export import build_banks, export_model
 from build_model.filter_graph import filter_graph
-from build_model.filter_network import FilterTables, assemble
+from build_model.filter_tables import FilterTables
 from build_model.hough_bank import CellBank, LineBoxes
-from build_model.pixel_mask import Bits, runs_of
+from build_model.pixel_mask import runs_of
 from build_model.verify.ball_camera import PRECISION_BITS, BallCamera, BallEntry, Ends, Slice, columns, columns_crossed
-from build_model.verify.cell_proof import Counterexample, prove_cell
+from build_model.verify.cell_claim import cell_claims
+from build_model.verify.cell_proof import prove_cell
 from build_model.verify.cli import REFUTED, app
-from build_model.verify.model_graph import NETWORK_PREFIX, read_tables
-from build_model.verify.proof import axis_borders, cell_boxes, cell_claims, check_outputs, displacement_px, verify_model
+from build_model.verify.counterexample import Counterexample
+from build_model.verify.displacement import displacement_px
+from build_model.verify.model_graph import read_tables
+from build_model.verify.outputs import check_outputs
+from build_model.verify.proof import axis_borders, cell_boxes, verify_model
+from build_model.window import Bits
 from runtime.camera import ground_scale, project, project_points
 from runtime.image import runway_image
-from runtime.model.model_file import METADATA_KEY, ModelError, metadata_digest
+from runtime.model.format import METADATA_KEY, NETWORK_PREFIX, ModelError, metadata_digest
 from runtime.scene import Axis, Bank, Calibration, Camera, Domain, Marking, Runway, Scene, Tolerance
 
 SCENE = Scene(
@@ -131,7 +137,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
         paths[name] = folder / f"{number}.onnx"
         with pytest.MonkeyPatch.context() as patch:
             if name == "several rows a cell":
-                patch.setattr("build_model.filter_network.row_width", lambda _entries: WIDTH)
+                patch.setattr("build_model.assembly.row_width", lambda _entries: WIDTH)
             export_model(scene, paths[name], estimator=small_network(scene, folder / f"network{number}.onnx"))
     return paths
 
@@ -150,7 +156,7 @@ def model(files: dict[str, Path]) -> Model:
 @pytest.fixture
 def model_in_rows(files: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> Model:
     """The same with several rows a cell, which it keeps when it is written anew."""
-    monkeypatch.setattr("build_model.filter_network.row_width", lambda _entries: WIDTH)
+    monkeypatch.setattr("build_model.assembly.row_width", lambda _entries: WIDTH)
     return taken_apart(files["several rows a cell"])
 
 
@@ -686,7 +692,7 @@ def test_borders_are_the_runtimes() -> None:
 
 
 def test_displacement_holds_every_camera_within_the_calibration() -> None:
-    from build_model.pixel_mask import Window
+    from build_model.window import Window
 
     window, camera = Window(10, 60, 5, 100), TOLERANT.camera
     bound = displacement_px(TOLERANT, window)

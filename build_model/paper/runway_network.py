@@ -26,7 +26,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from build_model.pixel_mask import Window
+from build_model.window import Window
 from runtime.scene import Camera
 
 ABS_PAIRS = ((0, 1), (2, 3), (4, 5), (6, 7), (8, 9), (10, 11), (12, 13), (14, 15), (2, 6), (10, 14), (3, 7), (11, 15))

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
-if TYPE_CHECKING:
-    from build_model.verify.proof import VerificationReport
+from runtime.errors import fail
+from runtime.model.format import ModelError
 
 try:
     import typer
@@ -14,9 +14,9 @@ try:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
     from rich.table import Table
 
-    from build_model.cli import fail
+    from build_model.verify import proof
 except ImportError as error:
-    raise SystemExit(f"verify-model: the package {error.name!r} is missing; pip install 'glideproof[build]'") from None
+    fail(f"verify-model: the package {error.name!r} is missing; pip install 'glideproof[build]'")
 
 REFUTED = 1
 app = typer.Typer(add_completion=False)
@@ -28,17 +28,12 @@ def verify_model(
     jobs: Annotated[int, typer.Option(min=1, help="Processes that prove cells.")] = 2,
 ) -> None:
     """Prove a model's certificate anew, from its own tensors and the scene in its metadata. Exit code 1: a counterexample; 2: unusable."""
-    try:
-        from build_model.verify.proof import verify_model
-        from runtime.model.model_file import ModelError
-    except ImportError as error:
-        fail(f"verify-model: the package {error.name!r} is missing; pip install 'glideproof[build]'")
     console = Console()
     columns = TextColumn("cells"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     try:
         with Progress(*columns, console=console) as bar:
             task = bar.add_task("cells", total=None)
-            report = verify_model(model, jobs, lambda done, total: bar.update(task, completed=done, total=total))
+            report = proof.verify_model(model, jobs, lambda done, total: bar.update(task, completed=done, total=total))
     except ModelError as error:
         fail(error)
     console.print(_table(model, report))
@@ -46,7 +41,7 @@ def verify_model(
         fail(f"{model}: refuted: {report.counterexample}", REFUTED)
 
 
-def _table(model: Path, report: VerificationReport) -> Table:
+def _table(model: Path, report: proof.VerificationReport) -> Table:
     table = Table(title=str(model), show_header=False, title_justify="left")
     table.add_column()
     table.add_column(overflow="fold")

@@ -16,18 +16,15 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from build_model.filter_graph import BIT, IR_VERSION, OPSET, filter_graph
-from build_model.filter_network import FilterTables
+from build_model.filter_graph import BIT, filter_graph
+from build_model.filter_tables import FilterTables, RunTable, SpatialRuns
 from build_model.partition import Partition
-from build_model.pixel_mask import Window
-from build_model.run_table import RunTable, SpatialRuns
-from build_model.verify.cell_proof import demand
+from build_model.verify.counterexample import demand
+from build_model.window import Window
+from runtime.model.format import IR_VERSION, NETWORK_OUTPUT, NETWORK_PREFIX, OPSET, SIDES
 from runtime.scene import STATE_NAMES, Scene
 
 Part = onnx.NodeProto | onnx.ValueInfoProto
-NETWORK_PREFIX = "state_network/"
-"""Names of NN_e's nodes and constants start with this."""
-NETWORK_OUTPUT = "network_state"
 CONTROL_FLOW = ("If", "Loop", "Scan")
 
 
@@ -66,13 +63,14 @@ def read_tables(graph: onnx.GraphProto, cells: Partition) -> FilterTables:
     known = bool(((painted.cell >= 0) & (painted.cell < len(cells))).all())
     demand(same and known, "graph: the constants spatial_run_* do not fit each other or the cells")
     lower, upper = (
-        np.stack([constants.read(f"{name}_{side}", np.float32, rows, width) for name in STATE_NAMES], axis=-1)
-        for side in ("lower", "upper")
+        np.stack([constants.read(f"{name}_{side}", np.float32, rows, width) for name in STATE_NAMES], axis=-1) for side in SIDES
     )
-    line_lower, line_upper = (constants.read(f"line_{side}", np.float64, rows, width, 4) for side in ("lower", "upper"))
+    line_lower, line_upper = (constants.read(f"line_{side}", np.float64, rows, width, 4) for side in SIDES)
     return FilterTables(
         window=window,
         cells=cells,
+        cell_lower=np.nextafter(cells.lower.astype(np.float32), np.float32(-np.inf)),
+        cell_upper=np.nextafter(cells.upper.astype(np.float32), np.float32(np.inf)),
         row_cell=row_cell,
         runs=_read_runs(constants, window, len(cells), (rows, width)),
         spatial_runs=painted,

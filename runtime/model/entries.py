@@ -8,15 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.model.model_file import ModelError
+from runtime.model.format import SIDES, STATE_BOX_TENSORS, ModelError
 from runtime.scene import STATE_NAMES, Scene
 from runtime.state_set import StateSet, tangent_of_row
-
-SIDES = ("lower", "upper")
-STATE_BOX_TENSORS = tuple(f"{name}_{side}" for name in STATE_NAMES for side in SIDES)
-BOX_TENSORS = ("row_cell", *STATE_BOX_TENSORS, "line_lower", "line_upper", "reference_row", "must_light_size")
-MASK_TENSORS = ("spatial_run_cell", "spatial_run_index", "spatial_run_step", "window_first", "window_stop")
-"""Initialisers that hold every entry as a box of states and of line coordinates, and every cell's spatial mask."""
 
 
 @dataclass(frozen=True)

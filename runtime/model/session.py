@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import onnxruntime
 
-from runtime.model.model_file import ModelError
+from runtime.errors import one_line
+from runtime.model.format import BUDGETS, FRAME, OUTPUTS, ModelError
 from runtime.scene import Scene
 
-OUTPUTS = ("cell", "support", "mismatch", "passes", "cell_lower", "cell_upper", "filtered", "network_state")
 LOG_FATAL_ONLY = 4
 
 
@@ -32,8 +32,8 @@ def check_interface(session: onnxruntime.InferenceSession, scene: Scene, entries
     shapes |= {"cell_lower": [cells, 4], "cell_upper": [cells, 4]}
     types = {"cell": "int64", "support": "int32", "mismatch": "int32", "passes": "bool", "filtered": "uint8"}
     expected = {
-        "inputs": [("frame", "tensor(uint8)", frame)],
-        "budgets": [(budget, "tensor(int32)", []) for budget in ("extra_budget", "missed_budget")],
+        "inputs": [(FRAME, "tensor(uint8)", frame)],
+        "budgets": [(budget, "tensor(int32)", []) for budget in sorted(BUDGETS)],
         "outputs": [(output, f"tensor({types.get(output, 'float')})", shapes[output]) for output in sorted(OUTPUTS)],
     }
     for kind, values in zip(expected, (session.get_inputs(), session.get_overridable_initializers(), session.get_outputs()), strict=True):
@@ -44,4 +44,4 @@ def check_interface(session: onnxruntime.InferenceSession, scene: Scene, entries
 
 def reason_of(error: Exception) -> str:
     """An error of onnxruntime's on one line."""
-    return " ".join(str(error).split())[:200]
+    return one_line(error)[:200]

@@ -1,30 +1,32 @@
-"""bench-model: what a frame costs, beside the line detectors that the certified estimate replaces.
+"""What `bench-model` measures: what a frame costs, beside the line detectors that the certified estimate replaces.
 
 All methods see the same frames, one after the other in every round, in one process on one thread, so that what else the machine does
 falls on all alike; ratios are medians over the pairs of neighbouring runs. A method's frames are the exact image of a random state of
 the domain under clutter, and those of a recording, if there is one.
 """
 
+from __future__ import annotations
+
 import csv
 import io
 import itertools
 import os
 import platform
-import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
 
+import cv2
 import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from runtime.estimator import Estimate, Estimator
+from runtime.estimate import Estimate
+from runtime.estimator import Estimator
 from runtime.frames import FrameStream
 from runtime.image import runway_image
-from runtime.model.model_file import ModelError
+from runtime.recordings.recording import read_events
 from runtime.scene import Scene
 
 Frames = Sequence[NDArray[np.uint8]]
@@ -35,9 +37,9 @@ WINDOW_US = 40_000
 WARM_UP, WORKERS = 100, 2
 """Of the throughput: frames that are not counted, and cores of `estimate_many`."""
 THROUGHPUT_CLUTTER = 0.02
+"""Of the frames whose throughput is measured."""
 REFERENCE = "HoughLinesP"
 """The detector that ratios refer to."""
-USER_ERROR = 2
 
 
 @dataclass(frozen=True)
@@ -61,16 +63,12 @@ def cluttered_frames(scene: Scene, density: float, count: int, seed: int) -> Fra
 
 def recorded_frames(path: Path, shape: tuple[int, int], count: int) -> Frames:
     """`count` frames of a recording, evenly spread over it. Raises `RecordingError` and `EventError`."""
-    from runtime.recordings.recording import read_events
-
     frames = [frame for _, frame in FrameStream(shape, WINDOW_US).frames(read_events(path, shape))]
     return [frames[index] for index in np.linspace(0, len(frames) - 1, min(count, len(frames))).astype(int)] if frames else []
 
 
 def methods(estimator: Estimator) -> dict[str, Method]:
     """What is timed. The detectors take pixels of 0 and 255, which are made outside the clock."""
-    import cv2
-
     cv2.setNumThreads(1)
     segments = cv2.createLineSegmentDetector()
     return {
@@ -153,8 +151,6 @@ def throughput(estimator: Estimator, frames: Frames, count: int, refine: bool) -
 
 def machine() -> dict[str, str]:
     """Processor and versions."""
-    import cv2
-
     return {
         "processor": processor(),
         "cores": str(os.cpu_count()),
@@ -187,8 +183,6 @@ def as_csv(header: Mapping[str, str], rows: Sequence[Latency]) -> str:
 
 def chart(header: Mapping[str, str], rows: Sequence[Latency]) -> NDArray[np.uint8]:
     """Bars of the medians on a logarithmic scale, with a mark at p99: a picture (height, width, 3)."""
-    import cv2
-
     left, right, top, line = 330, 140, 60, 22
     kinds = list(dict.fromkeys(row.frames for row in rows))
     height = top + line * (len(rows) + 2 * len(kinds)) + 20
@@ -215,63 +209,3 @@ def chart(header: Mapping[str, str], rows: Sequence[Latency]) -> NDArray[np.uint
             write(f"{row.p50_ms:.3f} ms", picture.shape[1] - right + 20, y + 5)
             y += line
     return picture
-
-
-def bench_model_command() -> None:
-    """Entry point of `bench-model`."""
-    try:
-        import cv2
-        import typer
-        from rich.console import Console
-        from rich.table import Table
-    except ImportError as error:
-        raise SystemExit(f"bench-model: the package {error.name!r} is missing; pip install 'glideproof[recordings]'") from None
-
-    def bench_model(
-        model: Annotated[Path | None, typer.Argument(help="Model that export-model wrote; by default the paper's.")] = None,
-        frames: Annotated[int, typer.Option(min=1, help="Frames of each kind.")] = 50,
-        rounds: Annotated[int, typer.Option(min=1, help="How often each frame is seen.")] = 10,
-        recording: Annotated[Path | None, typer.Option(help="Event recording whose frames are timed too.")] = None,
-        cpu_time: Annotated[bool, typer.Option(help="Count the thread's time on the processor, if the machine is busy otherwise.")] = False,
-        output: Annotated[Path, typer.Option("-o", "--output", help="Folder for bench.csv and bench.png.")] = Path("out/bench"),
-        seed: Annotated[int, typer.Option(help="Seed of the frames.")] = 0,
-    ) -> None:
-        """Time the model beside OpenCV's line detectors, on one thread, on the same frames: table, bench.csv and bench.png."""
-        from runtime.frames import EventError
-        from runtime.recordings.recording import RecordingError
-
-        console = Console(width=None if sys.stdout.isatty() else 120)
-        rows: list[Latency] = []
-        try:
-            estimator = Estimator.load(model)
-            clock = time.thread_time if cpu_time else time.perf_counter
-            header = {"model": estimator.sha256[:16], **machine(), "clock": clock.__name__}
-            console.print(", ".join(f"{name} {value}" for name, value in header.items()), highlight=False)
-            for kind in benchmark(estimator, frames, rounds, recording, seed, clock):
-                console.print(_table(Table, kind))
-                rows += kind
-            for refine in (False, True):
-                seen = cluttered_frames(estimator.scene, THROUGHPUT_CLUTTER, frames, seed)
-                console.print(_rates(refine, *throughput(estimator, seen, frames * rounds, refine)), highlight=False)
-            output.mkdir(parents=True, exist_ok=True)
-            (output / "bench.csv").write_text(as_csv(header, rows), encoding="utf-8")
-            cv2.imwrite(str(output / "bench.png"), chart(header, rows))
-        except (ModelError, EventError, RecordingError, OSError) as error:
-            print(" ".join(str(error).split()), file=sys.stderr)
-            raise typer.Exit(USER_ERROR) from None
-
-    typer.run(bench_model)
-
-
-def _rates(refine: bool, alone: float, together: float) -> str:
-    kind = "with refinement" if refine else "without refinement"
-    return f"estimate_many {kind}, {WORKERS} workers: {together:,.0f} frames/s, {together / alone:.2f} x the {alone:,.0f} of single calls"
-
-
-def _table(make: Callable[..., Any], rows: Sequence[Latency]) -> Any:
-    table = make("method", "p50 ms", "p99 ms", "max ms", "p99/p50", f"/ {REFERENCE}", title=rows[0].frames, title_justify="left")
-    for row in rows:
-        figures = (row.p50_ms, row.p99_ms, row.max_ms)
-        spread, ratio = f"{row.p99_ms / row.p50_ms:.2f}", f"{row.ratio:.3f} = 1/{1 / row.ratio:.1f}"
-        table.add_row(row.method, *(f"{figure:.3f}" for figure in figures), spread, ratio)
-    return table

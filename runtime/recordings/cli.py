@@ -1,36 +1,48 @@
-"""The runtime's command: `run-model` takes a recording to estimates. It parses and prints; `runtime.recordings.report` writes."""
+"""The commands of the extra `recordings`: `run-model` takes a recording to estimates, `bench-model` measures. They parse and print."""
 
 from __future__ import annotations
 
 import itertools
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import Annotated, Any
 
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
+from numpy.typing import NDArray
+
+from runtime.errors import INTERRUPTED, complain, fail
+from runtime.estimator import Estimator
+from runtime.frames import EventError, FrameStream
+from runtime.model.format import ModelError
+from runtime.whole_file import write_whole
 
 try:
     import typer
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
     from rich.table import Table
+
+    from runtime.recordings.bench import (
+        REFERENCE,
+        THROUGHPUT_CLUTTER,
+        WORKERS,
+        Latency,
+        as_csv,
+        benchmark,
+        chart,
+        cluttered_frames,
+        machine,
+        throughput,
+    )
+    from runtime.recordings.draw import png
+    from runtime.recordings.recording import RecordingError, read_events
+    from runtime.recordings.report import Report, Truth, TruthError
 except ImportError as missing:
-    raise SystemExit(f"run-model: the package {missing.name!r} is missing; pip install 'glideproof[recordings]'") from None
+    fail(f"{Path(sys.argv[0]).name}: the package {missing.name!r} is missing; pip install 'glideproof[recordings]'")
 
-DAMAGED, USER_ERROR, INTERRUPTED = 1, 2, 130
-
-
-def fail(message: object, code: int = USER_ERROR) -> NoReturn:
-    """One line on stderr, then exit."""
-    _complain(message)
-    raise typer.Exit(code)
-
-
-def _complain(message: object) -> None:
-    print(" ".join(str(message).split()), file=sys.stderr)
+DAMAGED = 1
+"""Exit code where a recording ends early or is damaged."""
 
 
 def run_model(
@@ -49,16 +61,6 @@ def run_model(
     Exit code 0; 1 if the recording is damaged or ends early (what was good before is written); 2 if something given cannot be used;
     130 after Ctrl-C (what was done is written).
     """
-    try:
-        import cv2  # noqa: F401
-
-        from runtime.estimator import Estimator
-        from runtime.frames import EventError, FrameStream
-        from runtime.model.model_file import ModelError
-        from runtime.recordings.recording import RecordingError, read_events
-        from runtime.recordings.report import Report, Truth, TruthError
-    except ImportError as error:
-        fail(f"run-model: the package {error.name!r} is missing; pip install 'glideproof[recordings]'")
     console = Console(width=None if sys.stdout.isatty() else 120)
     try:
         estimator = Estimator.load(model, missed_budget=missed_budget)
@@ -89,7 +91,7 @@ def run_model(
     _print_summary(console, folder, summary)
     if any(lost.values()):
         noted = ", ".join(f"{count} {name.replace('_', ' the ')}" for name, count in lost.items() if count)
-        _complain(f"{recording}: events to note: {noted}; late ones and those outside the sensor are in no window")
+        complain(f"{recording}: events to note: {noted}; late ones and those outside the sensor are in no window")
     if fault:
         fail(f"{fault}; {summary['windows']} windows are written to {folder}", code)
 
@@ -100,8 +102,6 @@ def _microseconds(milliseconds: float) -> int:
 
 def _nonempty(recording: Path, packets: Iterator[NDArray[Any]]) -> Iterator[NDArray[Any]]:
     """The same packets, once one with an event is seen. Raises `RecordingError` if there is none, or if the file is unusable."""
-    from runtime.recordings.recording import RecordingError
-
     for packet in packets:
         if len(packet):
             return itertools.chain([packet], packets)
@@ -113,7 +113,7 @@ def _progress(console: Console) -> Progress:
     return Progress(texts[0], BarColumn(), texts[1], TimeElapsedColumn(), console=console, transient=True)
 
 
-def _estimate_all(stream: Any, packets: Iterator[NDArray[Any]], report: Any, refine: bool, bar: Progress | None) -> None:
+def _estimate_all(stream: FrameStream, packets: Iterator[NDArray[Any]], report: Report, refine: bool, bar: Progress | None) -> None:
     """Every window of the packets into the report."""
     task = None if bar is None else bar.add_task("windows", total=None, seconds=0.0)
     first_us = None
@@ -158,3 +158,51 @@ def _judged(counts: dict[str, Any]) -> str:
 def run_model_command() -> None:
     """Entry point of `run-model`."""
     typer.run(run_model)
+
+
+def bench_model(
+    model: Annotated[Path | None, typer.Argument(help="Model that export-model wrote; by default the paper's.")] = None,
+    frames: Annotated[int, typer.Option(min=1, help="Frames of each kind.")] = 50,
+    rounds: Annotated[int, typer.Option(min=1, help="How often each frame is seen.")] = 10,
+    recording: Annotated[Path | None, typer.Option(help="Event recording whose frames are timed too.")] = None,
+    cpu_time: Annotated[bool, typer.Option(help="Count the thread's time on the processor, if the machine is busy otherwise.")] = False,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder for bench.csv and bench.png.")] = Path("out/bench"),
+    seed: Annotated[int, typer.Option(help="Seed of the frames.")] = 0,
+) -> None:
+    """Time the model beside OpenCV's line detectors, on one thread, on the same frames: table, bench.csv and bench.png."""
+    console = Console(width=None if sys.stdout.isatty() else 120)
+    rows: list[Latency] = []
+    try:
+        estimator = Estimator.load(model)
+        clock = time.thread_time if cpu_time else time.perf_counter
+        header = {"model": estimator.sha256[:16], **machine(), "clock": clock.__name__}
+        console.print(", ".join(f"{name} {value}" for name, value in header.items()), highlight=False)
+        for kind in benchmark(estimator, frames, rounds, recording, seed, clock):
+            console.print(_latency_table(kind))
+            rows += kind
+        for refine in (False, True):
+            seen = cluttered_frames(estimator.scene, THROUGHPUT_CLUTTER, frames, seed)
+            console.print(_rates(refine, *throughput(estimator, seen, frames * rounds, refine)), highlight=False)
+        write_whole(output / "bench.csv", as_csv(header, rows).encode())
+        write_whole(output / "bench.png", png(chart(header, rows)))
+    except (ModelError, EventError, RecordingError, OSError) as error:
+        fail(error)
+
+
+def _rates(refine: bool, alone: float, together: float) -> str:
+    kind = "with refinement" if refine else "without refinement"
+    return f"estimate_many {kind}, {WORKERS} workers: {together:,.0f} frames/s, {together / alone:.2f} x the {alone:,.0f} of single calls"
+
+
+def _latency_table(rows: Sequence[Latency]) -> Table:
+    table = Table("method", "p50 ms", "p99 ms", "max ms", "p99/p50", f"/ {REFERENCE}", title=rows[0].frames, title_justify="left")
+    for row in rows:
+        figures = (row.p50_ms, row.p99_ms, row.max_ms)
+        spread, ratio = f"{row.p99_ms / row.p50_ms:.2f}", f"{row.ratio:.3f} = 1/{1 / row.ratio:.1f}"
+        table.add_row(row.method, *(f"{figure:.3f}" for figure in figures), spread, ratio)
+    return table
+
+
+def bench_model_command() -> None:
+    """Entry point of `bench-model`."""
+    typer.run(bench_model)

@@ -11,8 +11,7 @@
 
 `draw_history` shows states against time in the same colours.
 
-OpenCV comes with the extra `recordings` and is imported when something is drawn. Pictures illustrate; the certificate is the
-box's numbers.
+Pictures illustrate; the certificate is the box's numbers.
 """
 
 from __future__ import annotations
@@ -21,11 +20,12 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from runtime.camera import project
-from runtime.estimator import Box, Estimate
+from runtime.estimate import Box, Estimate
 from runtime.scene import STATE_NAMES, STATE_UNITS, Scene
 
 Picture = NDArray[np.uint8]
@@ -176,8 +176,6 @@ def draw_history(scene: Scene, history: History, width: int = HISTORY_WIDTH) -> 
 
 def _draw_panel(panel: Picture, moments: Sequence[Moment], axis: int, low: float, high: float) -> None:
     """One axis of the state over [low, high], with a fifth of that above and below."""
-    import cv2
-
     first, last, right_end = moments[0].start_us, moments[-1].stop_us, panel.shape[1] - 1
     margin = (high - low) / 5
 
@@ -253,8 +251,6 @@ def _magnified(pixels: Picture, view: View) -> Picture:
 
 def _outline(panel: Picture, whole: View, part: View) -> None:
     """Marks in `panel`, which shows `whole`, where `part` was taken from."""
-    import cv2
-
     corners = [(part.left, part.top), (part.left + part.shape[1], part.top + part.shape[0])]
     (left, top), (right, bottom) = (whole.points(corners) >> FRACTION_BITS).tolist()
     cv2.rectangle(panel, (left, top), (right, bottom), FRAME_BORDER, 1)
@@ -262,8 +258,6 @@ def _outline(panel: Picture, whole: View, part: View) -> None:
 
 def _draw_states(panel: Picture, scene: Scene, view: View, estimate: Estimate, truth: ArrayLike | None) -> None:
     """The box as a translucent band, then the markings of the estimate and of the truth."""
-    import cv2
-
     if estimate.box is not None:
         hulls = [cv2.convexHull(view.points(points)) for points in box_outlines(scene, estimate.box)]
         filled = np.zeros_like(panel)
@@ -312,10 +306,13 @@ def _ranges(box: Box) -> list[str]:
 
 def _write(strip: Picture, line: int, parts: Sequence[tuple[str, Colour]]) -> None:
     """Texts from left to right on one line of the strip, each in its colour; empty ones take no room."""
-    import cv2
-
     left = 8
     for text, colour in parts:
         if text:
             cv2.putText(strip, text, (left, line * LINE_HEIGHT + 17), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)
             left += cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)[0][0] + 18
+
+
+def png(picture: Picture) -> bytes:
+    """The picture as a PNG file."""
+    return cv2.imencode(".png", picture)[1].tobytes()

@@ -42,6 +42,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.errors import one_line
+
 EVENT = np.dtype([("t", np.int64), ("x", np.int32), ("y", np.int32), ("p", np.int8)])
 """What a packet holds: time (us), column, row, polarity."""
 
@@ -210,10 +212,6 @@ def _checked_to_the_end(path: Path, version: str | None, packets: Iterator[NDArr
         raise RecordingError(f"{path}: the file ends inside an event ({left} bytes of it); it was cut short, all events before it are kept")
 
 
-def _one_line(error: BaseException) -> str:
-    return " ".join(str(error).split())
-
-
 def _decoder(path: Path, **options: Any) -> Any:
     """faery's stream of the file."""
     try:
@@ -223,7 +221,7 @@ def _decoder(path: Path, **options: Any) -> Any:
     try:
         return faery.events_stream_from_file(path, **options)
     except Exception as error:  # faery raises bare Exception for a damaged file
-        raise RecordingError(f"{path}: {_one_line(error)}; it is damaged, or not of this kind") from error
+        raise RecordingError(f"{path}: {one_line(error)}; it is damaged, or not of this kind") from error
 
 
 def _converted(path: Path, packets: Any) -> Iterator[NDArray[Any]]:
@@ -231,7 +229,7 @@ def _converted(path: Path, packets: Any) -> Iterator[NDArray[Any]]:
         for packet in packets:
             yield _packet(packet["t"], packet["x"], packet["y"], packet["p"])
     except RuntimeError as error:
-        raise RecordingError(f"{path}: damaged here: {_one_line(error)}; all events before it are kept") from error
+        raise RecordingError(f"{path}: damaged here: {one_line(error)}; all events before it are kept") from error
 
 
 def write_packets(path: str) -> None:
@@ -284,7 +282,7 @@ def _read_or_refused(path: Path, wanted: str) -> Iterator[None]:
     except RecordingError:
         raise
     except Exception as error:
-        raise RecordingError(f"{path}: cannot be read ({_one_line(error)}); give {wanted}") from error
+        raise RecordingError(f"{path}: cannot be read ({one_line(error)}); give {wanted}") from error
 
 
 def _npz_packets(path: Path) -> Iterator[NDArray[Any]]:
@@ -394,7 +392,7 @@ def _column_packets(path: Path, length: int, part: Callable[[str, int, int], NDA
             columns = {name: part(name, start, stop) for name in "txyp"}
         except Exception as error:  # a damaged file fails in zipfile, zlib or HDF5, with classes of their own
             raise RecordingError(
-                f"{path}: events {start} to {stop}: {_one_line(error)}; damaged, all events before them are kept"
+                f"{path}: events {start} to {stop}: {one_line(error)}; damaged, all events before them are kept"
             ) from error
         for name, column in columns.items():
             limits = np.iinfo(EVENT[name])

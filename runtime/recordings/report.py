@@ -16,17 +16,22 @@ from __future__ import annotations
 import csv
 import json
 from collections import Counter
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.estimator import Estimate, Estimator
+from runtime.errors import one_line
+from runtime.estimate import Estimate
+from runtime.estimator import Estimator
 from runtime.image import dilated, runway_image
-from runtime.recordings.draw import History, Moment, Picture, draw_estimate, draw_history
+from runtime.recordings.draw import History, Moment, Picture, draw_estimate, draw_history, png
 from runtime.scene import STATE_NAMES, STATE_UNITS, Scene
+from runtime.whole_file import replacing, write_whole
 
 STATE_COLUMNS = [f"{name}_{unit}" for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True)]
 COLUMNS = [
@@ -59,7 +64,7 @@ class Truth:
             wanted = [names.index(name) for name in ("time_us", *STATE_COLUMNS)]
             rows = np.loadtxt(path, delimiter=",", skiprows=1, usecols=wanted, ndmin=2)
         except (OSError, ValueError) as error:
-            reason = " ".join(str(error).split())
+            reason = one_line(error)
             raise TruthError(f"{path}: {reason}; give a CSV file with the columns time_us, {', '.join(STATE_COLUMNS)}") from error
         if len(rows) == 0 or not np.isfinite(rows).all() or (np.diff(rows[:, 0]) <= 0).any():
             raise TruthError(f"{path}: found {len(rows)} lines, or times that do not ascend; give finite numbers in order of time")
@@ -171,16 +176,14 @@ class Report:
         self.step_us = step_us
         self.missed_budget = estimator.scene.tolerance.missed_budget if missed_budget is None else missed_budget
         self.tally = Tally()
-        folder.mkdir(parents=True, exist_ok=True)
-        self._csv_part = folder / "estimates.csv.part"
-        self._file = self._csv_part.open("w", encoding="utf-8", newline="")
+        self._parts = ExitStack()
+        self._file = self._parts.enter_context(replacing(folder / "estimates.csv")).open("w", encoding="utf-8", newline="")
         self._rows = csv.writer(self._file, lineterminator="\n")
         self._rows.writerow([*COLUMNS, *(TRUTH_COLUMNS if truth else [])])
         self._history = History()
         self._pictures: dict[int, Picture] = {}
         self._picture_every = 1
         self._writer: Any = None
-        self._video_part = folder / "overlay.part.mp4"
 
     def add(self, start_us: int, frame: NDArray[np.uint8], estimate: Estimate, milliseconds: float) -> None:
         """One window: its start, its frame, what the estimator made of it, and how long that took."""
@@ -208,34 +211,30 @@ class Report:
             self._pictures = {kept: shown for kept, shown in self._pictures.items() if kept % self._picture_every == 0}
 
     def _film(self, picture: Picture) -> None:
-        import cv2
-
         height, width = (side - side % 2 for side in picture.shape[:2])
         if self._writer is None:
             rate = min(1e6 / self.step_us, 60.0)
-            self._writer = cv2.VideoWriter(str(self._video_part), cv2.VideoWriter.fourcc(*"mp4v"), rate, (width, height))
+            part = self._parts.enter_context(replacing(self.folder / "overlay.mp4"))
+            self._writer = cv2.VideoWriter(str(part), cv2.VideoWriter.fourcc(*"mp4v"), rate, (width, height))
             if not self._writer.isOpened():
-                raise OSError(f"{self._video_part}: OpenCV cannot write this video; use --no-video")
+                raise OSError(f"{part}: OpenCV cannot write this video; use --no-video")
         self._writer.write(picture[:height, :width])
 
     def close(self, extra: dict[str, Any]) -> dict[str, Any]:
         """Finishes every file; `extra` goes into summary.json, which is returned."""
-        import cv2
-
         self._file.close()
-        self._csv_part.replace(self.folder / "estimates.csv")
         if self._writer is not None:
             self._writer.release()
-            self._video_part.replace(self.folder / "overlay.mp4")
+        self._parts.close()
         for old in self.folder.glob("overlay_*.png"):
             old.unlink()
         pictures = {f"overlay_{number:06d}.png": picture for number, picture in self._pictures.items()}
         pictures["state.png"] = draw_history(self.estimator.scene, self._history)
         for name, picture in pictures.items():
-            _write_whole(self.folder / name, cv2.imencode(".png", picture)[1].tobytes())
+            write_whole(self.folder / name, png(picture))
         budget = {"missed_budget": self.missed_budget, "assumptions": self._assumptions()}
         summary = {**extra, **self.tally.table(), **budget}
-        _write_whole(self.folder / "summary.json", json.dumps(summary, indent=2).encode())
+        write_whole(self.folder / "summary.json", json.dumps(summary, indent=2).encode())
         return summary
 
     def _assumptions(self) -> list[str]:
@@ -259,10 +258,3 @@ def _judgement_row(judgement: Judgement | None) -> list[object]:
         return [""] * len(TRUTH_COLUMNS)
     error = "" if judgement.error is None else judgement.error
     return [*judgement.truth.tolist(), judgement.missed, int(judgement.assumptions_hold), int(judgement.inside), error]
-
-
-def _write_whole(path: Path, content: bytes) -> None:
-    """Writes beside `path` and renames: what was there stays until the new file is whole."""
-    part = path.with_name(f"{path.name}.part")
-    part.write_bytes(content)
-    part.replace(path)

@@ -47,8 +47,6 @@ FACE_ROUNDS, FACE_GAIN = 6, 0.05
 """At most so many times, and until a round takes less than this share from every side of the box."""
 LARGEST_START = 512
 """More passing entries than this say that the frame tells next to nothing: they are left as they are, at a bounded cost."""
-MOST_TO_JOIN = 1024
-"""More pieces than this are taken for one connected part, whose hull is the same, at a bounded cost."""
 LARGEST_BLOCK = 2**19
 """Sets are contracted so many at once that their markings have no more rows than this between them: memory is bounded."""
 NO_COLUMN = np.int16(2**15 - 1)
@@ -490,26 +488,3 @@ def _extent(sets: StateSet) -> Floats:
     """Sides of the box around all sets, along theta, y and z; of no sets, 0."""
     intervals = np.stack([sets.theta, sets.y, sets.z])
     return intervals[..., 1].max(axis=1, initial=-np.inf) - intervals[..., 0].min(axis=1, initial=np.inf)
-
-
-def connected_parts(sets: StateSet) -> list[NDArray[np.int64]]:
-    """Numbers of the sets in each connected part of their union: parts are joined where boxes (theta, x, y, z) touch.
-
-    No set may be empty. Every round of the loops adds a set to a part, or ends it: there are no more rounds than twice the sets.
-    """
-    if len(sets) > MOST_TO_JOIN:
-        return [np.arange(len(sets))]
-    bounds = np.stack([sets.theta, sets.x, sets.y, sets.z])  # axes first, so that numpy compares whole rows of pairs
-    starts_before_end = np.logical_and.reduce(bounds[:, :, None, 0] <= bounds[:, None, :, 1], axis=0)
-    touch = starts_before_end & starts_before_end.T
-    left: Bits = np.ones(len(sets), dtype=bool)
-    parts: list[NDArray[np.int64]] = []
-    for first in range(len(sets)):
-        if not left[first]:
-            continue
-        size, reached = 0, np.array([first])
-        while len(reached) > size:
-            size, reached = len(reached), np.union1d(reached, np.flatnonzero(touch[reached].any(axis=0)))
-        parts.append(reached)
-        left[reached] = False
-    return parts

@@ -11,12 +11,11 @@ the output: the same command goes on where it was stopped, and begins anew if mo
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import sys
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
 
@@ -26,44 +25,15 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn, track
 from rich.table import Table
 
-import runtime
-from coverage.judge import HALF_WIDTHS, Tally, Violation, judge_frame, quantile
+from coverage.chunk import Chunk, code, digest
+from coverage.judge import HALF_WIDTHS, Tally, Violation, quantile
 from coverage.models import DERIVED, build_model
 from coverage.scenarios import Scenario, scenarios
-from coverage.states import Stage
 from runtime import Estimator
+from runtime.whole_file import write_whole
 
 CHUNK = 250
 COUNTS = ("frames", "judged", "certified", "violations", "pixels_lost", "no_runway", "at_boundary", "named", "fallbacks", "unrefined")
-
-
-@dataclass(frozen=True)
-class Chunk:
-    """Frames `first` to `first + frames - 1` of a scenario."""
-
-    scenario: Scenario
-    path: str
-    recording: str | None
-    seed: int
-    first: int
-    frames: int
-    campaign: str
-    """Digest of all that the frames and their estimates depend on."""
-
-    @property
-    def key(self) -> tuple[str, str, int, int]:
-        """What a finished chunk is found again by."""
-        return self.campaign, self.scenario.name, self.first, self.frames
-
-    def run(self) -> tuple[Chunk, Tally, list[Violation]]:
-        """Judges the frames."""
-        stage = Stage.of(self.path, self.recording)
-        tally, violations = Tally(), []
-        for number in range(self.first, self.first + self.frames):
-            counts, found = judge_frame(stage, self.scenario, self.seed, number)
-            tally += counts
-            violations += found
-        return self, tally, violations
 
 
 class Journal:
@@ -83,9 +53,7 @@ class Journal:
             if key in wanted:
                 self.done[key] = Tally.read(entry["tally"]), [Violation(**each) for each in entry["violations"]]
                 kept.append(line)
-        beside = path.with_suffix(".part")
-        beside.write_text("".join(line + "\n" for line in kept), encoding="utf-8")
-        beside.replace(path)
+        write_whole(path, "".join(line + "\n" for line in kept).encode())
 
     def add(self, chunk: Chunk, tally: Tally, violations: list[Violation]) -> None:
         """Appends a finished chunk."""
@@ -95,17 +63,6 @@ class Journal:
         with self.path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(entry) + "\n")
         self.done[chunk.key] = tally, violations
-
-
-def digest(paths: Iterable[Path]) -> str:
-    """One sha256 of the contents of files, in order."""
-    return hashlib.sha256("".join(hashlib.sha256(path.read_bytes()).hexdigest() for path in paths).encode()).hexdigest()
-
-
-def code() -> list[Path]:
-    """The files that decide what a frame is and what is said of it."""
-    here = Path(__file__).parent
-    return [*sorted(Path(runtime.__file__).parent.rglob("*.py")), *sorted(here.glob("*.py")), here.parent / "rational_image.py"]
 
 
 def chunks_of(models: dict[str, Path], chosen: list[Scenario], frames: int, recording: Path | None, seed: int) -> list[Chunk]:
@@ -174,9 +131,7 @@ def report(chunks: list[Chunk], journal: Journal, output: Path) -> int:
     for each in violations[:20]:
         print(f'{each.fault}\n    state {each.state}\n    --seed {each.seed} --replay "{each.scenario}#{each.number}"')
     tables = {"scenarios": {name: summary(tally) for name, tally in results.items()}, "violations": [asdict(each) for each in violations]}
-    beside = output.with_suffix(".part.json")
-    beside.write_text(json.dumps(tables, indent=2), encoding="utf-8")
-    beside.replace(output)
+    write_whole(output, json.dumps(tables, indent=2).encode())
     return len(violations)
 
 

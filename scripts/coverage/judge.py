@@ -71,7 +71,7 @@ def quantile(histogram: Counter[int], share: float) -> float:
 
 @dataclass(frozen=True)
 class Violation:
-    """A certificate that does not hold, with what is needed to see it again: `coverage.py --replay "SCENARIO#NUMBER"`."""
+    """A certificate that does not hold, with what is needed to see it again: `--replay "SCENARIO#NUMBER"`."""
 
     scenario: str
     seed: int

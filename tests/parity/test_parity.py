@@ -22,14 +22,16 @@ from onnx.reference.op_run import OpRun
 from rounding_bound import exact_state_and_bound
 from scenes import SCENES, Frame, random_clutter
 
+from build_model.assembly import assemble
 from build_model.export import build_banks
-from build_model.filter_graph import BUDGETS as FILTER_BUDGETS
-from build_model.filter_graph import IR_VERSION, OPSET, filter_graph
-from build_model.filter_network import NEVER, FilterNetwork, assemble
+from build_model.filter_graph import filter_graph
+from build_model.filter_network import FilterNetwork
 from build_model.hough_bank import CellBank
 from build_model.state_network import StateNetwork
 from runtime.estimator import Estimator
 from runtime.image import runway_image
+from runtime.model.format import BUDGETS as FILTER_BUDGETS
+from runtime.model.format import IR_VERSION, OPSET, PADDING_SIZE
 from runtime.scene import Scene
 
 ModelOf = Callable[[str], Path]
@@ -145,7 +147,7 @@ def test_onnxruntime_gives_the_torch_networks_outputs(model_of: ModelOf, name: s
 @pytest.mark.parametrize(("name", "width"), [("paper", 64), ("paper", 7), ("tolerant, free x", 3), ("one cell", 1)])
 def test_rows_of_any_width_give_the_same(monkeypatch: pytest.MonkeyPatch, name: str, width: int) -> None:
     """A cell's entries in several rows: all outputs as the torch network gives them; `passes` cut into rows, padding never among it."""
-    monkeypatch.setattr("build_model.filter_network.row_width", lambda _entries: width)
+    monkeypatch.setattr("build_model.assembly.row_width", lambda _entries: width)
     scene = SCENES[name]
     banks = build_banks(scene)
     network, tables = FilterNetwork(scene, banks), assemble(scene, banks)
@@ -156,7 +158,7 @@ def test_rows_of_any_width_give_the_same(monkeypatch: pytest.MonkeyPatch, name: 
         expected, found = network(torch.from_numpy(frame), *budgets), evaluate(model, frame, budgets)
         for output in REFERENCE:
             assert np.array_equal(found[output], expected[output].numpy()), (output, budgets)
-        assert not (found["passes"] & (tables.must_light_size == NEVER)).any()
+        assert not (found["passes"] & (tables.must_light_size == PADDING_SIZE)).any()
         assert np.array_equal(np.bincount(tables.row_cell, weights=found["passes"].sum(axis=1)), found["support"])
 
 
@@ -474,10 +476,10 @@ def test_inputs_and_outputs_are_those_of_the_table(model_of: ModelOf, name: str)
 def test_padding_never_passes(model_of: ModelOf) -> None:
     """Cells of the paper have unlike numbers of entries; no frame passes what fills them up, at the largest budget."""
     tensors = {tensor.name: onnx.numpy_helper.to_array(tensor) for tensor in onnx.load(model_of("paper")).graph.initializer}
-    padding = tensors["must_light_size"] == NEVER
+    padding = tensors["must_light_size"] == PADDING_SIZE
     assert padding.any()
     weakest = int(tensors["must_light_size"][~padding].min())
     for frame in frames_of(SCENES["paper"]):
         outputs = evaluate(session(model_of("paper")), frame, (weakest - 1, -1))
         assert not (outputs["passes"] & padding).any()
-        assert (outputs["mismatch"] < NEVER // 2).all()
+        assert (outputs["mismatch"] < PADDING_SIZE // 2).all()

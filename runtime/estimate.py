@@ -1,0 +1,91 @@
+"""What an estimate is: an outcome, a certified box, a state; and the error of a frame that a model cannot take."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+
+class FrameError(ValueError):
+    """A frame that the model cannot take."""
+
+    def __init__(self, actual: str, expected: str) -> None:
+        super().__init__(f"frame: found {actual}, expected {expected}")
+        self.actual = actual
+        self.expected = expected
+
+
+class Outcome(enum.Enum):
+    """What a frame says: CERTIFIED, a box is given; NO_RUNWAY, no state of the domain is consistent with it."""
+
+    CERTIFIED = "certified"
+    NO_RUNWAY = "no runway"
+
+
+@dataclass(frozen=True)
+class Box:
+    """Certified: the state lies between `lower` and `upper`, (4,) float64 each, read-only, under the model's assumptions."""
+
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        for name in ("lower", "upper"):
+            side = np.array(getattr(self, name), dtype=np.float64)
+            side.flags.writeable = False
+            object.__setattr__(self, name, side)
+        if self.lower.shape != (4,) or not (np.isfinite(self.lower) & np.isfinite(self.upper) & (self.lower <= self.upper)).all():
+            raise ValueError(f"box: found lower {self.lower} and upper {self.upper}, expected four finite ordered bounds")
+
+    def __reduce__(self) -> tuple[type[Box], tuple[NDArray[np.float64], NDArray[np.float64]]]:
+        return Box, (self.lower, self.upper)  # a copy from another process is checked and read-only too
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """Middle of the box, (4,); exact on an axis of width 0."""
+        return np.clip((self.lower + self.upper) / 2, self.lower, self.upper)
+
+    @property
+    def half_widths(self) -> NDArray[np.float64]:
+        """Half of the box's extent, (4,)."""
+        return (self.upper - self.lower) / 2
+
+    def contains(self, state: ArrayLike) -> bool:
+        """True if a state (4,) lies in the box, borders included; False if it has a NaN."""
+        point = np.asarray(state, dtype=np.float64)
+        return bool(((self.lower <= point) & (point <= self.upper)).all())
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What one frame tells. States are [theta, x, y, z] in rad and m (`runtime.camera`)."""
+
+    outcome: Outcome
+    box: Box | None
+    """Certified; None where nothing is."""
+    state: NDArray[np.float64] | None
+    """The proposal if it lies in the box, else the box's centre; None where nothing is certified."""
+    used_fallback: bool
+    """True if the centre was taken."""
+    network_state: NDArray[np.float64]
+    """NN_e's answer, uncertified."""
+    cell: int
+    """The cell with the most consistent entries, or with the smallest mismatch where none is consistent."""
+    passing: NDArray[np.int64]
+    """Numbers of the cells that are consistent with the frame."""
+    mismatch: int
+    """Smallest missed + extra of `cell`."""
+    filtered: NDArray[np.uint8]
+    """The frame within the spatial masks of the passing cells: keeps every lit pixel of the runway."""
+    regions: tuple[Box, ...]
+    """Connected parts of what is consistent, each in its box; more than one is an ambiguity. One without refinement."""
+    touches_boundary: bool
+    """The box reaches a face of the domain: it holds the state only if the aircraft is in the domain."""
+
+    @property
+    def certified(self) -> bool:
+        """True if a box is given."""
+        return self.outcome is Outcome.CERTIFIED
