@@ -6,13 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from hypothesis import settings
+from hypothesis import reject, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from build_model.spatial_filter import reference_row
 from runtime.camera import ground_scale
-from runtime.scene import Axis, Bank, Calibration, Camera, Domain, EstimatorTraining, Marking, Runway, Scene, Tolerance
+from runtime.scene import Axis, Bank, Calibration, Camera, Domain, EstimatorTraining, Marking, Runway, Scene, SceneError, Tolerance
 from runtime.state_set import StateSet, scale_range, tangent_of_row
 
 Floats = NDArray[np.float64]
@@ -60,6 +60,38 @@ BARELY_ABOVE = seen_from(replace(ONE_CELL, runway=Runway((Marking("L", -0.1, 0.0
 BARELY_BELOW = seen_from(replace(ONE_CELL, runway=Runway((Marking("L", -0.1, 0.0, 0.3), Marking("R", 0.1, 0.0, 0.1)))), 320.0, 520.0)
 """In some states the right marking lies just above, or just below, the frame: a camera that is off brings it into view."""
 
+STRIP = replace(
+    PAPER,
+    camera=Camera(width=346, height=260, focal_length_m=0.006, pixel_pitch_m=18.5e-6),
+    runway=Runway((Marking("L", -0.5, 0.0, 4.0), Marking("R", 0.5, 0.0, 4.0))),
+    domain=Domain(Axis((0.4, 0.5), 0.1), Axis((0.0,), 0.0), Axis((1.25, 1.75), 0.5), Axis((2.25, 2.75), 0.5)),
+    bank=Bank(pitch_bins=4, distance_bins=2, column_px=0.5),
+)
+"""A drone over a strip of 1 x 4 m."""
+AIRPORT = replace(
+    PAPER,
+    camera=Camera(width=1280, height=720, focal_length_m=0.008, pixel_pitch_m=4.86e-6),
+    runway=Runway((Marking("L", -22.5, 0.0, 2500.0), Marking("R", 22.5, 0.0, 2500.0))),
+    domain=Domain(Axis((0.0, 0.02, 0.04), 0.02), Axis((0.0,), 0.0), Axis((53.0,), 28.0), Axis((1000.0,), 200.0)),
+    bank=Bank(pitch_bins=4, distance_bins=2, column_px=0.5),
+)
+"""A runway of 45 x 2500 m, 3 degrees down its final approach, the horizon in view in some states."""
+LOW_OVER_THE_THRESHOLD = replace(
+    AIRPORT, domain=Domain(Axis((0.006,), 0.004), Axis((0.0,), 0.0), Axis((10.0,), 1.0), Axis((6.0,), 10.0)), bank=Bank(2, 1, 2.0)
+)
+"""The near ends are up to 15,000 rows below the frame."""
+FAR_FROM_THE_ORIGIN = replace(
+    STRIP,
+    runway=Runway((Marking("L", 99_999.5, -1e5, 4.0), Marking("R", 100_000.5, 0.5 - 1e5, 3.0))),
+    domain=Domain(Axis((0.4, 0.5), 0.1), Axis((1e5,), 0.2), Axis((1.25, 1.75), 0.5), Axis((100_002.25, 100_002.75), 0.5)),
+)
+"""The strip with coordinates of 100 km, its markings unlike and x free."""
+STRAIGHT_DOWN = replace(
+    STRIP,
+    runway=Runway((Marking("L", -0.5, 0.0, 0.6), Marking("R", 0.3, 0.1, 0.6))),
+    domain=Domain(Axis((1.4,), 0.2), Axis((0.0,), 0.0), Axis((2.0,), 0.5), Axis((0.5,), 0.4)),
+)
+
 SCENES = {
     "paper": PAPER,
     "three markings": THREE_MARKINGS,
@@ -103,7 +135,10 @@ def state_sets(draw: st.DrawFn, scene: Scene) -> StateSet:
     """One set of states: a box within the scene's domain, cut by an interval of the scale at the row where its middle sees the runway."""
     lower, upper = scene.domain.lower, scene.domain.upper
     box = np.array([draw(intervals(low, high, 0.1)) for low, high in zip(lower, upper, strict=True)])
-    row = reference_row(scene.camera, box[:, 0], box[:, 1], scene.runway.ends_z_m.mean())
+    try:
+        row = reference_row(scene.camera, box[:, 0], box[:, 1], scene.runway.ends_z_m.mean())
+    except SceneError:  # some state of the box sees the sky there, as none of an entry does
+        reject()
     tangent = tangent_of_row(scene.camera, np.array([row]))
     low, high = (float(part[0]) for part in scale_range(scene.camera, box[:1], box[2:3], tangent))
     theta, x, y, z = box[:, None, :]

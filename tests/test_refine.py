@@ -11,11 +11,16 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scenes import (
+    AIRPORT,
     CUT_BELOW,
     CUT_LEFT,
     CUT_RIGHT,
+    FAR_FROM_THE_ORIGIN,
     FREE_X,
+    LOW_OVER_THE_THRESHOLD,
     PAPER,
+    STRAIGHT_DOWN,
+    STRIP,
     THREE_MARKINGS,
     UNLIKE_MARKINGS,
     Floats,
@@ -44,6 +49,11 @@ CASES = {
     "cut left": CUT_LEFT,
     "cut right": CUT_RIGHT,
     "cut below": CUT_BELOW,
+    "strip": STRIP,
+    "airport": AIRPORT,
+    "low over the threshold": LOW_OVER_THE_THRESHOLD,
+    "far from the origin": FAR_FROM_THE_ORIGIN,
+    "straight down": STRAIGHT_DOWN,
 }
 SCENES = pytest.mark.parametrize("scene", CASES.values(), ids=CASES)
 
