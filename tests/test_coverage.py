@@ -23,6 +23,7 @@ pytest.importorskip("faery", reason="the extra 'recordings' is not installed")
 
 import typer
 from coverage import campaign, frames, states
+from coverage.chunk import code
 from coverage.judge import Tally, claimed_by_none, judge_frame, quantile
 from coverage.models import DERIVED
 from coverage.scenarios import Scenario, camera_off, scenarios
@@ -254,6 +255,15 @@ def test_a_stopped_campaign_goes_on_and_another_one_starts_anew(repository: Path
     assert len(file.read_text().splitlines()) == len(chunks)
     assert campaign.Journal(file, chunks).done == whole
     assert campaign.Journal(file, small_work(path, 2)).done == {}
+
+
+def test_the_digest_covers_what_a_frame_depends_on_and_nothing_else() -> None:
+    root = Path(__file__).parents[1]
+    covered = {path.relative_to(root).as_posix() for path in code()}
+    deciding = ("runtime/refine/refiner.py", "runtime/state_set.py", "runtime/recordings/recording.py", "build_model/hough_bank.py")
+    assert {*deciding, "scripts/coverage/judge.py", "scripts/coverage/frames.py", "scripts/rational_image.py"} <= covered
+    others = ("runtime/recordings/draw.py", "build_model/export.py", "build_model/verify/proof.py", "scripts/coverage/campaign.py")
+    assert covered.isdisjoint(others)
 
 
 def with_shifted_entries(path: Path, to: Path, by: float) -> Path:
