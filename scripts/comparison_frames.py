@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from runtime import Scene
 from runtime.image import runway_image
+from runtime.whole_file import replacing
 
 
 def draw_frames(scene: Scene, count: int, clutter: float, seed: int) -> Iterator[tuple[NDArray[np.float64], NDArray[np.uint8]]]:
@@ -27,6 +28,5 @@ def draw_frames(scene: Scene, count: int, clutter: float, seed: int) -> Iterator
 
 def write_csv(path: Path, header: Sequence[str], rows: Sequence[Sequence[object]]) -> None:
     """Writes a table of figures, one row a frame; folders are made as needed."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with replacing(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         csv.writer(file).writerows([header, *rows])

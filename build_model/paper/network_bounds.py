@@ -1,4 +1,4 @@
-"""Bounds of NN_r at every pixel over a box of zeta, by any of the methods.
+"""Bounds of NN_r at every pixel over a box of zeta, by any of the methods. Those of partial networks are intersected, as Meyer does.
 
 Soundness. Boxes of zeta are snapped outward to a dyadic grid so coarse that NN_r, its Jacobian and the terms of Proposition 2 are exact
 in float64 over them: a bound of 0 is 0.

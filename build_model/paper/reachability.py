@@ -4,8 +4,7 @@ This is the paper's road to the spatial filters S: bound zeta = h(xi) over a cel
 upper bound is 0 is dark in every image of the cell. `build_model.spatial_filter` takes a closer one, because a box of zeta
 forgets that all four coordinates belong to one state; `scripts/compare_spatial_filters.py` prints what that costs.
 
-Proposition 2 is used as it was proved by Meyer (Reachability analysis of neural networks using mixed monotonicity, 2022): the
-terms with alpha stand outside the network, not in its argument as printed, and bounds of partial networks are intersected.
+Bounds of h are in `projection_bounds`, those of NN_r in `network_bounds`, Proposition 2 in `mixed_monotonicity`.
 
 Soundness. Boxes of zeta are rounded outward, then snapped outward to a dyadic grid so coarse that NN_r, its Jacobian and the
 terms of Proposition 2 are exact in float64 over them: a bound of 0 is 0. The outward margin also covers ties: a marking that
