@@ -44,8 +44,7 @@ class EntryProver:
     def __init__(self, claim: CellClaim, number: int, entry: BallEntry) -> None:
         self.claim, self.number, self.camera = claim, number, entry.camera
         self.reach_px = claim.scene.tolerance.line_px
-        self.margin = arb("inf")
-        """The least margin of all bounds that were proved, px."""
+        self.margin = arb("inf")  # the least margin of the bounds that were proved, px
         self.root = Slice(entry, *entry.theta)
         self.markings = self._seen(entry)
         width = self.root.high - self.root.low

@@ -11,9 +11,9 @@ from runtime.state_set import StateSet
 
 
 def refined_by_cell(refiner: Refiner, entries: Entries, passes: NDArray[np.bool_], frame: NDArray[np.bool_]) -> StateSet:
-    """What is left of the entries that pass, (rows, width), where the lit pixels of a cell's S are claimed to be the runway's.
+    """What is left of the entries that pass, (rows, width), if the lit pixels of the true cell's S are the runway's, all but e of them.
 
-    But for the refiner's `extra_budget` of them. At tolerance 0, where each pixel of the frame, (height, width), is its own witness.
+    `frame`: (height, width). It is its own witness: these claims are made at tolerance 0 only. e is the refiner's `extra_budget`.
     """
     cells = np.unique(entries.row_cell[passes.any(axis=1)])
     alone = entries.row_cell[:, None]
