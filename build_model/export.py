@@ -142,8 +142,13 @@ def build_banks(scene: Scene, jobs: int = 1, progress: Progress = _silent, dask:
 
 
 def paper_bounds(scene: Scene, jobs: int = 1, dask: str | None = None) -> list[PaperBound | None]:
-    """The paper's bound of every cell, in the order of the partition, by the workers of `build_banks`. Raises `ClusterError`."""
+    """The paper's bound of every cell, in the order of the partition, by the workers of `build_banks`. Raises `ClusterError`.
+
+    None for a cell that has none, as one that is a single state.
+    """
     cells = partition(scene)
+    if (cells.lower == cells.upper).all():
+        return [None] * len(cells)
     work = (joblib.delayed(paper_bound)(scene, lower, upper) for lower, upper in zip(cells.lower, cells.upper, strict=True))
     with _workers(jobs, dask):
         return [cast(PaperBound | None, bound) for bound in joblib.Parallel(return_as="generator")(work)]

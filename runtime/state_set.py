@@ -50,6 +50,31 @@ class StateSet:
     def __getitem__(self, index: NDArray | slice) -> StateSet:
         return StateSet(self.theta[index], self.x[index], self.y[index], self.z[index], self.scale[index], self.tangent[index])
 
+    @property
+    def empty(self) -> NDArray[np.bool_]:
+        """True for sets with an inverted interval, (sets,)."""
+        return np.logical_or.reduce([side[:, 0] > side[:, 1] for side in (self.theta, self.x, self.y, self.z, self.scale)])
+
+    def contracted(self, **bounds: tuple[Floats, Floats]) -> StateSet:
+        """The sets with some intervals but theta's intersected with others, each given as lower and upper bounds (sets,)."""
+        closer = {}
+        for name, (low, high) in bounds.items():
+            own = getattr(self, name)
+            closer[name] = np.stack([np.maximum(own[:, 0], low), np.minimum(own[:, 1], high)], axis=-1)
+        return self._with(**closer)
+
+    def emptied(self, which: NDArray[np.bool_]) -> StateSet:
+        """The sets, some of them empty: their scale is inverted, and above 0."""
+        return self._with(scale=np.where(which[:, None], [2.0, 1.0], self.scale))
+
+    def _with(self, **fields: Floats) -> StateSet:
+        """Other intervals beside the same theta, whose sines and cosines are not taken again."""
+        sets = replace(self, **fields)
+        for name in ("turn", "reference_fall", "condition"):
+            if name in self.__dict__:
+                sets.__dict__[name] = self.__dict__[name]
+        return sets
+
     @cached_property
     def turn(self) -> tuple[Floats, Floats]:
         """Cosine and sine of theta, (sets, 2) each."""

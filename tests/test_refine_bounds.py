@@ -12,7 +12,10 @@ from hypothesis import strategies as st
 from scenes import PAPER, Floats
 
 from build_model.verify.ball_camera import BallCamera
-from runtime.refine.refiner import Refiner, _column_margins_px, _ends, _Grid, _Pixels
+from runtime.refine.altitude import contract_by_altitude
+from runtime.refine.borders import Borders, _column_margins_px, _ends
+from runtime.refine.ground import ground_distances
+from runtime.refine.lit_pixels import LitPixels
 from runtime.scene import Axis, Camera, Domain, Marking, Runway, Scene
 from runtime.state_set import StateSet, contract, scale_ratio, tangent_of_row
 
@@ -109,7 +112,7 @@ def test_columns_and_distances_at_a_row_of_the_frame(sight: Sight, share: float)
         assert arb(min(sides) - margin) <= column
         assert column <= arb(max(sides) + margin)
         assert margin < 2.0**-20 + spacing(sight) * 3 * (scene.camera.width + abs(across) * sets.scale[0, 1])
-    nearest, farthest = Refiner(scene, 0, -1)._distances(sets, np.array([[row]]))
+    nearest, farthest = ground_distances(scene.camera, sets, np.array([[row]]))
     distance = arb(sight.state[2]) * reach / fall
     if distance > 0:  # a marking lies ahead
         assert arb(nearest[0, 0]) * (1 - arb(2) ** -46) <= distance  # the last rounding is left to who subtracts an end from it
@@ -125,8 +128,7 @@ def test_altitude_and_scale_bound_each_other(sight: Sight, share: float) -> None
         sets = sight.sets()
         true = arb(sight.state[2]) if axis == "y" else sight.scale(sight.reference_row)
         getattr(sets, axis)[:] *= [1 - share, 1 + share]
-        Refiner(scene, 0, -1)._by_altitude(sets)
-        low, high = getattr(sets, axis)[0].tolist()
+        low, high = getattr(contract_by_altitude(scene.camera, sets), axis)[0].tolist()
         assert arb(low) <= true
         assert true <= arb(high)
         assert high - low < 4 * spacing(sight) * high
@@ -150,8 +152,8 @@ def test_rows_out_of_the_frame_are_not_looked_at() -> None:
     state = np.array([0.0, 0.0, 10.0, 0.0144])
     domain = Domain(*(Axis((value,), 0.0) for value in state.tolist()))
     scene = Scene(camera, Runway((Marking("m", -22.5, 0.0, 2500.0),)), domain, PAPER.bank)
-    pixels = _Pixels.of(np.zeros(camera.shape, dtype=bool), (slice(None), slice(None)), beyond=True)
-    grid = _Grid.of(scene, Sight(scene, state, 253.0).sets(), pixels)
-    assert grid.near[0][0, 0] > 1e6
-    assert len(grid.rows) <= camera.height + 3
-    assert grid.crossed.sum() == camera.height - 246  # from the row of the far end down to the frame's lower border
+    pixels = LitPixels.of(np.zeros(camera.shape, dtype=bool), (slice(None), slice(None)), beyond=True)
+    borders = Borders.of(scene, Sight(scene, state, 253.0).sets(), pixels)
+    assert borders.near[0][0, 0] > 1e6
+    assert len(borders.row) <= camera.height + 3
+    assert borders.crossed[:, 1:-1].sum() == camera.height - 246  # from the row of the far end down to the frame's lower border

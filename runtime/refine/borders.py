@@ -1,0 +1,90 @@
+"""Where the markings of sets of states cross the borders between rows, as data for the contractors.
+
+A border of a row of pixels is a line v = r here. All that a contractor asks of it is the range of the ground's scale on it, relative to the
+set's own (`ratio`), the columns in which a marking may meet it, and whether the markings of all states of a set cross it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from runtime.refine.interval import Bits, Floats, Interval
+from runtime.refine.lit_pixels import LitPixels
+from runtime.rounding import above, below, column_margin_px, lowered, raised
+from runtime.scene import Scene
+from runtime.state_set import StateSet, end_rows, scale_ratio, tangent_of_row
+
+
+@dataclass(frozen=True)
+class Borders:
+    """The borders of the rows that each set can show in the window; row i of pixels lies between borders i and i + 1."""
+
+    row: Floats
+    """v of each border, (rows + 1, sets), px."""
+    ratio: Interval
+    """Range of R = g(row) / scale there, (rows + 1, sets)."""
+    near: Interval
+    far: Interval
+    """Ranges of the rows of each marking's near and far end, (markings, sets), px."""
+    crossed: Bits
+    """True where the marking crosses the border, below the horizon, in all states of the set: (markings, rows + 1, sets)."""
+    columns: Interval
+    """First and last column of the pixels in whose closed columns the marking may meet the border, (markings, rows + 1, sets)."""
+    margin_px: Floats
+    """Covers what rounding does to a column, (sets,)."""
+
+    @staticmethod
+    def of(scene: Scene, sets: StateSet, pixels: LitPixels) -> Borders:
+        """The borders between the farthest and the nearest ends; one row on either side stands for all rows out of the window."""
+        near, far = _ends(scene, sets)
+        first = np.clip(np.floor(far[0].min(axis=0)), pixels.top, pixels.bottom)
+        last = np.clip(np.floor(near[1].max(axis=0)), pixels.top, pixels.bottom)
+        row = first + np.arange(int((last - first).max()) + 2, dtype=np.float64)[:, None]
+        ratio = scale_ratio(sets, tangent_of_row(scene.camera, row))
+        crossed = (row > far[1][:, None]) & (row < near[0][:, None]) & (ratio[0] > 0)
+        margin_px = _column_margins_px(scene, sets)
+        return Borders(row, ratio, near, far, crossed, _columns(scene, sets, ratio, margin_px), margin_px)
+
+    def across_rows(self) -> Interval:
+        """First and last column that each marking may light in each row, (markings, rows, sets)."""
+        low, high = self.columns
+        return np.minimum(low[:, :-1], low[:, 1:]), np.maximum(high[:, :-1], high[:, 1:])
+
+
+def across(scene: Scene, sets: StateSet) -> Interval:
+    """Range of p_x - x, (markings, sets), m."""
+    x_m = scene.runway.x_m[:, None]
+    return x_m - sets.x[:, 1], x_m - sets.x[:, 0]
+
+
+def _columns(scene: Scene, sets: StateSet, ratio: Interval, margin_px: Floats) -> Interval:
+    u0 = scene.camera.u0
+    across_low, across_high = (side[:, None] for side in across(scene, sets))
+    slow, fast = sets.scale[:, 0] * ratio[0], sets.scale[:, 1] * ratio[1]
+    low, high = np.minimum(across_low * slow, across_low * fast), np.maximum(across_high * slow, across_high * fast)
+    return np.floor(low + (u0 - margin_px)), np.floor(high + (u0 + margin_px))
+
+
+def _ends(scene: Scene, sets: StateSet) -> tuple[Interval, Interval]:
+    """Ranges of the rows of each marking's near and far end, (markings, sets) each; equal distances are computed once.
+
+    v - v0 = F tan(beta - theta), so an error of an angle grows by 1 + tan^2: that of rounding, of the altitude that a scale stands for, and
+    of the distance as a sum of coordinates.
+    """
+    distances = np.array(sorted(set(scene.runway.ends_z_m.flat)))
+    focal, v0 = scene.camera.focal_px, scene.camera.v0
+    angle = sets.condition[:, None] + np.abs(distances) / (sets.z[:, :1] + distances)
+    low, high = end_rows(scene.camera, sets, distances)
+    low = below(lowered(low, angle * (focal + (low - v0) ** 2 / focal))).T
+    high = above(raised(high, angle * (focal + (high - v0) ** 2 / focal))).T
+    near, far = np.searchsorted(distances, scene.runway.ends_z_m.T)
+    return (low[near], high[near]), (low[far], high[far])
+
+
+def _column_margins_px(scene: Scene, sets: StateSet) -> Floats:
+    """What a column u0 + (p_x - x) scale R that is in the frame may be off by, (sets,): R is as uncertain as s(theta, t_ref)."""
+    across_low, across_high = across(scene, sets)
+    offset = np.maximum(-across_low, across_high).max(axis=0) * sets.scale[:, 1]
+    return column_margin_px(sets.condition * (offset + max(abs(scene.camera.u0), abs(scene.camera.width - scene.camera.u0))))
