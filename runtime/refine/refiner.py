@@ -40,12 +40,28 @@ from runtime.state_set import StateSet
 
 CONTRACTORS: tuple[Callable[[StateSet, Sight], StateSet], ...] = (contract_by_offsets, contract_by_claims, contract_by_ends)
 """Each gives subsets of the sets that hold all their states which the frame allows; in the order in which one helps the next."""
-CUTS = (2, 4)
-"""Slices of theta that every piece is cut into, round after round."""
-FACE_PIECES, FACE_CUTS = 2, (4, 3)
-"""Then the pieces that carry a face of the box are cut: how many a face, and into how many slices of theta and of z each."""
-FACE_ROUNDS, FACE_GAIN = 6, 0.05
-"""At most so many times, and until a round takes less than this share from every side of the box."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """How the entries are cut: all of them at first, then in rounds the pieces that carry a face of the box around what is left."""
+
+    first: int
+    """Slices of theta that every entry is cut into."""
+    theta: int
+    z: int
+    scale: int
+    """Parts that a piece which carries a face is cut into along each interval."""
+    pieces: int
+    """How many pieces a face."""
+    rounds: int
+    gain: float
+    """At most so many rounds, and until one takes less than this share from every side of the box."""
+
+
+NONE_MISSED = Search(first=4, theta=4, z=2, scale=1, pieces=2, rounds=8, gain=0.02)
+SOME_MISSED = Search(first=4, theta=3, z=2, scale=2, pieces=4, rounds=20, gain=0.02)
+"""Missed pixels are counted where windows are a pixel or two wide (`missed`): then smaller pieces pay, cut along the scale too."""
 LARGEST_START = 512
 """More passing entries than this say that the frame tells next to nothing: they are left as they are, at a bounded cost."""
 LARGEST_BLOCK = 2**19
@@ -71,16 +87,15 @@ class Refiner:
             return entries
         witnesses = LitPixels.of(frame, self.window, beyond=True)
         claims = None if claimed is None else Claims(LitPixels.of(claimed, self.window, beyond=False), self.extra_budget)
-        pieces = entries
-        for cuts in CUTS:
-            pieces = self._contracted(witnesses, claims, _cut(pieces, theta=cuts))
+        search = NONE_MISSED if self.missed_budget == 0 else SOME_MISSED
+        pieces = self._contracted(witnesses, claims, _cut(entries, theta=search.first))
         extent = _extent(pieces)
-        for _ in range(FACE_ROUNDS if len(pieces) else 0):
-            outer = _carries_a_face(pieces, FACE_PIECES)
-            finer = self._contracted(witnesses, claims, _cut(pieces[outer], theta=FACE_CUTS[0], z=FACE_CUTS[1]))
+        for _ in range(search.rounds if len(pieces) else 0):
+            outer = _carries_a_face(pieces, search.pieces)
+            finer = self._contracted(witnesses, claims, _cut(pieces[outer], theta=search.theta, z=search.z, scale=search.scale))
             pieces, before = joined(finer, pieces[~outer]), extent
             extent = _extent(pieces)
-            if (extent > (1 - FACE_GAIN) * before).all():
+            if (extent > (1 - search.gain) * before).all():
                 break
         return pieces
 
