@@ -109,6 +109,8 @@ def _scale_bins(scene: Scene, x: NDArray[np.float64], scale: NDArray[np.float64]
     lever_m = max(np.abs(scene.runway.x_m[:, None] - x).max(), SMALLEST_LEVER_M)
     step = max(math.floor(scene.bank.column_px / lever_m / SCALE_STEP), 1) * SCALE_STEP
     edges = np.arange(math.floor(scale[0] / step), math.ceil(scale[1] / step) + 1) * step
+    if edges[0] == 0:
+        edges[0] = 2.0 ** (math.frexp(scale[0])[1] - 2)  # below every scale of the cell, and above 0, by which altitudes are divided
     return np.stack([edges[:-1], edges[1:]], axis=-1)
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scenes import BARELY_ABOVE, BARELY_BELOW, CUT_LEFT, FREE_X, OFF_BY, PAPER, SHIFTED, THREE_MARKINGS, UNLIKE_MARKINGS, Floats, tolerant
 
-from build_model.hough_bank import CellBank, LineBoxes, cell_bank, line_boxes
+from build_model.hough_bank import SCALE_STEP, CellBank, LineBoxes, _scale_bins, cell_bank, line_boxes
 from build_model.partition import partition
 from runtime.camera import ground_scale, project, project_points
 from runtime.image import image_of_ends, runway_image
@@ -200,3 +200,12 @@ def test_a_pitch_that_ends_at_zero_loses_no_state() -> None:
     states = states_of_cell(lower, upper, 400, 4)
     states[:, 0] = 0.0
     assert holding(scene, bank.lines, states).any(axis=1).all()
+
+
+def test_bins_of_a_small_scale_begin_above_0() -> None:
+    """Altitudes are divided by the scale; a runway so far away that its scale is below one step of the bins must not be lost."""
+    smallest = SCALE_STEP / 3
+    bins = _scale_bins(PAPER, np.array([0.0, 0.0]), np.array([smallest, 5 * SCALE_STEP]))
+    assert 0 < bins[0, 0] <= smallest
+    assert (bins[1:, 0] == bins[:-1, 1]).all()
+    assert bins[-1, 1] >= 5 * SCALE_STEP
