@@ -29,6 +29,8 @@ Point = tuple[Fraction, Fraction]
 SURE_RAD = 1e-12
 """Angles farther apart than this are told apart by float64, whose atan is right to some 1e-16."""
 FIRST_BITS = 128
+NEARLY_BESIDE = Fraction(1, 2**40)
+"""Where a marking that runs from before to behind the camera is cut, as a share of what lies before it: far out of view."""
 
 
 def turn(half_tangent: Fraction) -> tuple[Fraction, Fraction]:
@@ -153,6 +155,13 @@ class RationalView:
 
     def project(self, state: RationalState, p_x: Fraction, p_z: Fraction) -> Point:
         """(u, v) of the ground point (p_x, 0, p_z), px. Raises ValueError where it is not in front of the camera."""
+        right, down, depth = self._turned(state, p_x, p_z)
+        if depth <= 0:
+            raise ValueError("the point lies behind the camera")
+        return self.u0 + self.focal * right / depth, self.v0 + self.focal * down / depth
+
+    def _turned(self, state: RationalState, p_x: Fraction, p_z: Fraction) -> tuple[Fraction, Fraction, Fraction]:
+        """The ground point in the camera's frame: to the right, down and ahead, m."""
         cosine, sine = turn(state.tangent)
         ahead = p_z + state.z
         right, down, depth = p_x - state.x, state.y * cosine - ahead * sine, state.y * sine + ahead * cosine
@@ -162,13 +171,28 @@ class RationalView:
         if self.roll:
             cosine, sine = turn(self.roll)
             right, down = right * cosine - down * sine, right * sine + down * cosine
-        if depth <= 0:
-            raise ValueError("the point lies behind the camera")
-        return self.u0 + self.focal * right / depth, self.v0 + self.focal * down / depth
+        return right, down, depth
 
     def segments(self, state: RationalState) -> list[tuple[Point, Point]]:
-        """The near and the far end of each marking in the image."""
-        return [(self.project(state, stripe.x, stripe.near_z), self.project(state, stripe.x, stripe.far_z)) for stripe in self.stripes]
+        """The near and the far end of each marking in the image, as far as it lies in front of the camera."""
+        return [
+            (self.project(state, stripe.x, near), self.project(state, stripe.x, far))
+            for stripe in self.stripes
+            for near, far in self._ahead(state, stripe)
+        ]
+
+    def _ahead(self, state: RationalState, stripe: Stripe) -> list[tuple[Fraction, Fraction]]:
+        """The part of a stripe that lies in front of the camera, by its p_z; none if all of it is behind. The depth is affine in p_z."""
+        near, far = stripe.near_z, stripe.far_z
+        start, stop = self._turned(state, stripe.x, near)[2], self._turned(state, stripe.x, far)[2]
+        if start > 0 and stop > 0:
+            return [(near, far)]
+        if start <= 0 and stop <= 0:
+            return []
+        beside = near - (far - near) * start / (stop - start)
+        ahead = far if stop > 0 else near
+        cut = beside + (ahead - beside) * NEARLY_BESIDE
+        return [(cut, far) if stop > 0 else (near, cut)]
 
     def image(self, state: RationalState) -> RunwayImage:
         """Every pixel of the frame that a marking meets."""

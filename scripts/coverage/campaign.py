@@ -17,7 +17,7 @@ import sys
 from collections.abc import Iterable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import joblib
 import typer
@@ -26,6 +26,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from coverage.chunk import Chunk, code, digest
+from coverage.journal import ResultJournal
 from coverage.judge import HALF_WIDTHS, Tally, Violation, quantile
 from coverage.models import DERIVED, build_model
 from coverage.scenarios import Scenario, scenarios
@@ -36,33 +37,19 @@ CHUNK = 250
 COUNTS = ("frames", "judged", "certified", "violations", "pixels_lost", "no_runway", "at_boundary", "named", "fallbacks", "unrefined")
 
 
-class Journal:
-    """Finished chunks, one line of JSON each; what is not of this campaign is dropped."""
+class Journal(ResultJournal[tuple[Tally, list[Violation]]]):
+    """Finished chunks; what is not of this campaign is dropped."""
 
     def __init__(self, path: Path, chunks: Iterable[Chunk]) -> None:
-        self.path = path
-        self.done: dict[tuple[str, str, int, int], tuple[Tally, list[Violation]]] = {}
-        wanted = {chunk.key for chunk in chunks}
-        kept = []
-        for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else ():
-            try:
-                entry = json.loads(line)
-            except ValueError:  # the last line of a campaign that was killed
-                continue
-            key = (entry["campaign"], entry["scenario"], entry["first"], entry["frames"])
-            if key in wanted:
-                self.done[key] = Tally.read(entry["tally"]), [Violation(**each) for each in entry["violations"]]
-                kept.append(line)
-        write_whole(path, "".join(line + "\n" for line in kept).encode())
+        super().__init__(path, (chunk.key for chunk in chunks), self._read, self._written_out)
 
-    def add(self, chunk: Chunk, tally: Tally, violations: list[Violation]) -> None:
-        """Appends a finished chunk."""
-        campaign, scenario, first, frames = chunk.key
-        entry = {"campaign": campaign, "scenario": scenario, "first": first, "frames": frames}
-        entry |= {"tally": vars(tally), "violations": [asdict(each) for each in violations]}
-        with self.path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(entry) + "\n")
-        self.done[chunk.key] = tally, violations
+    @staticmethod
+    def _read(tables: dict[str, Any]) -> tuple[Tally, list[Violation]]:
+        return Tally.read(tables["tally"]), [Violation(**each) for each in tables["violations"]]
+
+    @staticmethod
+    def _written_out(result: tuple[Tally, list[Violation]]) -> dict[str, Any]:
+        return {"tally": vars(result[0]), "violations": [asdict(each) for each in result[1]]}
 
 
 def chunks_of(models: dict[str, Path], chosen: list[Scenario], frames: int, recording: Path | None, seed: int) -> list[Chunk]:
@@ -88,7 +75,7 @@ def run_campaign(chunks: list[Chunk], journal: Journal, jobs: int) -> None:
         task = bar.add_task("frames", total=sum(chunk.frames for chunk in chunks), completed=done, violations=found)
         results = joblib.Parallel(n_jobs=jobs, return_as="generator_unordered")(joblib.delayed(Chunk.run)(chunk) for chunk in missing)
         for chunk, tally, violations in results:  # pyright: ignore[reportGeneralTypeIssues]
-            journal.add(chunk, tally, violations)
+            journal.enter(chunk.key, (tally, violations))
             found += len(violations)
             bar.update(task, advance=chunk.frames, violations=found)
 

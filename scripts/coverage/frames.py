@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import functools
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -19,8 +20,6 @@ Pixels = NDArray[np.int64]
 """Numbers of pixels in the flattened frame, in the order in which they go dark."""
 
 WINDOW_US = 40_000
-LONGEST_LIST = 64
-"""Pixels that are tried when some shall go dark."""
 
 
 @functools.cache
@@ -138,15 +137,19 @@ def must_light(rng: Rng, picture: Picture) -> Pixels:
 
 
 def put_out(picture: Picture, order: Pixels, missed: int) -> None:
-    """Darkens pixels in the given order, as long as no more than `missed` pixels of the true image lack a witness."""
-    stage, pixels = picture.stage, picture.frame.reshape(-1)
-    ideal = image_of(stage.view, picture.states[0])
-    for pixel in order[:LONGEST_LIST].tolist() if missed else ():
-        was = pixels[pixel]
-        pixels[pixel] = False
-        if stage.unwitnessed(ideal, picture.frame) > missed:
-            pixels[pixel] = was
-            break
+    """Darkens pixels in the given order, as many as leave no more than `missed` pixels of the true image without a witness."""
+    if missed == 0:
+        return
+    stage, ideal = picture.stage, image_of(picture.stage.view, picture.states[0])
+
+    def put_out_first(count: int) -> Frame:
+        frame = picture.frame.copy()
+        frame.reshape(-1)[order[:count]] = False
+        return frame
+
+    counts = range(1, len(order) + 1)
+    dark = bisect.bisect_right(counts, missed, key=lambda count: stage.unwitnessed(ideal, put_out_first(count)))
+    picture.frame = put_out_first(dark)
 
 
 def keep_out_of_spatial_mask(rng: Rng, picture: Picture, extra: int) -> None:

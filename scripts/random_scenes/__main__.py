@@ -1,0 +1,12 @@
+"""Runs the campaign over random scenes: python scripts/random_scenes [options]."""
+
+import sys
+from pathlib import Path
+
+import typer
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(Path(__file__).parents[1]))  # Python puts this folder there, not the one that holds the packages
+    from random_scenes.campaign import main
+
+    typer.run(main)
