@@ -41,6 +41,8 @@ SMALLEST_STEP, LARGEST_STEP = 2.0**-8, 1.5
 """Shares of a difference between two states that a step takes."""
 RANDOM_PX = 2.0**-12, 1.0
 """Standard deviation of a random step, px at the markings."""
+LEAPS = 0.1
+"""Share of the steps that change z alone, to any of the domain's."""
 ENOUGH, ROUNDS_WITHOUT = 0.01, 3
 """The search ends when no side of the extent has grown by this share in so many rounds."""
 MOST_ROUNDS = 60
@@ -160,6 +162,10 @@ class Sampler:
         at_random /= [reach, reach, 1, 1]
         step = np.where(rng.random((STEPS, 1)) < 0.8, share * (known[one] - known[other]), at_random)
         states = self._line.states(known[start] + step)
+        leap = rng.random(STEPS) < LEAPS  # the same lines at any distance: parts that lie apart, where ends fall on other missed pixels
+        domain = self._scene.domain
+        states[leap] = self.states[start[leap]]
+        states[leap, 3] = rng.uniform(domain.lower[3], domain.upper[3], int(leap.sum()))
         return states[self._allowed(states)]
 
     def _allowed(self, states: Floats) -> Integers:
