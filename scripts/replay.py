@@ -93,7 +93,7 @@ def run(replay: Replay, estimator: Estimator, stream: FrameStream) -> None:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
     lost = f"{stream.late_events} late, {stream.unsorted_events} unsorted, {stream.outside_events} outside the sensor"
-    print(f"events: {lost}")
+    print(f"events: {lost}, {stream.misdated_events} misdated; {stream.runs} runs of the clock")
 
 
 def main(

@@ -118,13 +118,15 @@ def test_the_stream_goes_on_after_a_flush():
 
 
 def test_a_jump_in_time_gives_its_empty_windows_one_at_a_time():
-    stream = FrameStream(SHAPE, 1)
-    frames = stream.feed(events_of([(0, 0, 0, 1), (2**60, 1, 1, 1)]))
+    stream = FrameStream(SHAPE, 1, largest_gap_us=2**61)
+    stream.feed(events_of([(0, 0, 0, 1), (2**60, 1, 1, 1)]))
+    # A single event after a pause may be wrong: the stream's end, or more events, say that it is not.
+    frames = stream.flush()
     assert [(start, int(frame.sum())) for start, frame in itertools.islice(frames, 3)] == [(0, 1), (1, 0), (2, 0)]
     # The next iterator goes on where this one was left.
     assert next(stream.feed(events_of([])))[0] == 3
     with pytest.raises(EventError, match="use FrameStream"):
-        events_to_frames(events_of([(0, 0, 0, 1), (2**60, 1, 1, 1)]), SHAPE, 1)
+        events_to_frames(events_of([(0, 0, 0, 1), (2**60, 1, 1, 1)]), SHAPE, 1, largest_gap_us=2**61)
 
 
 def test_a_packet_is_taken_even_if_its_frames_are_not_asked_for():
@@ -178,6 +180,28 @@ def test_unusable_events_are_refused(events, message):
 def test_unusable_sizes_are_refused(arguments, message):
     with pytest.raises(EventError, match=message):
         FrameStream(*arguments)
+    with pytest.raises(EventError, match="largest_gap_us: found 0"):
+        FrameStream(SHAPE, 10, largest_gap_us=0)
+
+
+@pytest.mark.parametrize("spread_us", [1, 500, 1_000, 2_000, 10_000, 10**6])
+@pytest.mark.parametrize("count", [2, 3, 100, 1000])
+def test_one_call_sorts_events_that_are_in_no_order_over_any_time(count, spread_us):
+    """Also over more time than a camera's packets are out of order by."""
+    drawn = np.random.default_rng(count)
+    events = events_of([(int(t) * spread_us, int(x), 0, 1) for t, x in drawn.integers(0, (60, SHAPE[1]), (count, 2))])
+    starts, frames = events_to_frames(events, SHAPE, 7 * spread_us, largest_gap_us=2**61)
+    assert list(zip(starts.tolist(), frames.tolist(), strict=True)) == naive_frames(events, 7 * spread_us, 7 * spread_us)
+
+
+@pytest.mark.parametrize("wrong_us", [0, 10**15 + 10**9])
+def test_one_call_refuses_a_wrong_time_and_a_clock_that_breaks(wrong_us):
+    good = events_of([(10**15 + 500 * number, 0, 0, 1) for number in range(400)])
+    with pytest.raises(EventError, match=r"^t: found 1 events at times that their neighbours contradict.*largest_gap_us 5000000"):
+        events_to_frames(np.insert(good, 200, np.array((wrong_us, 0, 0, 1), dtype=EVENT)), SHAPE, 40_000)
+    restarted = np.concatenate([good, good])
+    with pytest.raises(EventError, match=r"2 runs of the clock.*use FrameStream"):
+        events_to_frames(restarted, SHAPE, 40_000)
 
 
 def test_one_call_refuses_events_outside_the_sensor():

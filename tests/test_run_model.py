@@ -169,7 +169,7 @@ def test_options_that_cannot_be_used_are_an_error_of_one_line(recording, tmp_pat
         ("other.csv", b"t,x@320,y@240,p\n1,2,3,1\n", "sensor of 320x240 px, expected 640x480"),
         ("zeros.npz", b"\0" * 100, "cannot be read"),
         ("faulty.csv", b"t,x,y,p\n1,2,3,one\n", "line 2: found 1,2,3,one"),
-        ("kind.txt", b"1", "unknown kind '.txt'"),
+        ("kind.log", b"1", "unknown kind '.log'"),
     ],
 )
 def test_an_unusable_recording_is_an_error_of_one_line_and_nothing_is_written(tmp_path, name, content, message):

@@ -12,7 +12,10 @@ from import_graph import all_imports_of, imports_of, source_of
 
 ROOT = Path(__file__).parents[1]
 ROOTS = (ROOT, ROOT / "scripts")
-EXTRAS = ("torch", "onnx", "onnxscript", "typer", "rich", "flint", "joblib", "faery", "cv2", "h5py", "dask", "distributed")
+EXTRAS = (
+    *("torch", "onnx", "onnxscript", "typer", "rich", "flint", "joblib", "faery", "cv2", "h5py", "hdf5plugin", "lz4", "zstandard"),
+    *("dask", "distributed"),
+)
 """Import names of what the embedded runtime must do without."""
 SHARED_WITH_VERIFIER = {
     "build_model.assumptions",  # words

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from runtime.errors import INTERRUPTED, complain, fail
 from runtime.estimator import Estimator
-from runtime.frames import EventError, FrameStream
+from runtime.frames import LARGEST_GAP_US, EventError, FrameStream
 from runtime.model.format import ModelError
 from runtime.whole_file import write_whole
 
@@ -36,7 +36,8 @@ try:
         throughput,
     )
     from runtime.recordings.draw import png
-    from runtime.recordings.recording import RecordingError, read_events
+    from runtime.recordings.noted import lines_of, noted_of
+    from runtime.recordings.recording import Notes, RecordingError, read_events
     from runtime.recordings.report import Report, Truth, TruthError
 except ImportError as missing:
     fail(f"{Path(sys.argv[0]).name}: the package {missing.name!r} is missing; pip install 'glideproof[recordings]'")
@@ -47,10 +48,11 @@ DAMAGED = 1
 
 def run_model(
     model: Annotated[Path, typer.Argument(help="Model that export-model wrote.")],
-    recording: Annotated[Path, typer.Argument(help="Event recording: .raw .dat .aedat4 .es .csv .npz .h5")],
+    recording: Annotated[Path, typer.Argument(help="Event recording: .raw .dat .aedat4 .es .csv .txt .npz .h5")],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Folder to write; by default the recording's name in out/.")] = None,
     window_ms: Annotated[float, typer.Option(help="Length of a window.")] = 40.0,
     step_ms: Annotated[float | None, typer.Option(help="From one window to the next, at most the window; less overlaps.")] = None,
+    largest_gap_ms: Annotated[float, typer.Option(help="A longer pause begins a new run of windows.")] = LARGEST_GAP_US / 1000,
     missed_budget: Annotated[int | None, typer.Option(help="Pixels of the runway that may be dark, in place of the model's.")] = None,
     truth: Annotated[Path | None, typer.Option(help="CSV: time_us, theta_rad, x_m, y_m, z_m. Judges every window.")] = None,
     video: Annotated[bool, typer.Option("--video/--no-video", help="Write overlay.mp4.")] = True,
@@ -65,9 +67,10 @@ def run_model(
     try:
         estimator = Estimator.load(model, missed_budget=missed_budget)
         step_us = None if step_ms is None else _microseconds(step_ms)
-        stream = FrameStream(estimator.scene.camera.shape, _microseconds(window_ms), step_us)
+        gap_us, notes = _microseconds(largest_gap_ms), Notes()
+        stream = FrameStream(estimator.scene.camera.shape, _microseconds(window_ms), step_us, largest_gap_us=gap_us)
         known = None if truth is None else Truth.load(truth)
-        packets = _nonempty(recording, read_events(recording, estimator.scene.camera.shape))
+        packets = _nonempty(recording, read_events(recording, estimator.scene.camera.shape, notes))
         folder = output or Path("out") / recording.stem
         report = Report(folder, estimator, stream.window_us, stream.step_us, known, video=video, missed_budget=missed_budget)
     except (ModelError, EventError, RecordingError, TruthError, OSError) as error:
@@ -84,14 +87,12 @@ def run_model(
         fault, code = "interrupted", INTERRUPTED
     except OSError as error:
         fail(f"{folder}: cannot be written ({error})")
-    lost = {"late": stream.late_events, "unsorted": stream.unsorted_events, "outside_sensor": stream.outside_events}
+    noted = noted_of(stream, notes)
     source = {"model": str(model), "sha256": estimator.sha256, "recording": str(recording), "fault": fault}
-    sizes = {"window_us": stream.window_us, "step_us": stream.step_us, "events_to_note": lost}
-    summary = report.close({**source, **sizes})
+    summary = report.close({**source, "window_us": stream.window_us, "step_us": stream.step_us, **noted})
     _print_summary(console, folder, summary)
-    if any(lost.values()):
-        noted = ", ".join(f"{count} {name.replace('_', ' the ')}" for name, count in lost.items() if count)
-        complain(f"{recording}: events to note: {noted}; late ones and those outside the sensor are in no window")
+    for line in lines_of(noted):
+        complain(f"{recording}: {line}")
     if fault:
         fail(f"{fault}; {summary['windows']} windows are written to {folder}", code)
 
@@ -116,20 +117,21 @@ def _progress(console: Console) -> Progress:
 def _estimate_all(stream: FrameStream, packets: Iterator[NDArray[Any]], report: Report, refine: bool, bar: Progress | None) -> None:
     """Every window of the packets into the report."""
     task = None if bar is None else bar.add_task("windows", total=None, seconds=0.0)
-    first_us = None
+    seconds = 0.0
     for start_us, frame in stream.frames(packets):
         begun = time.perf_counter()
         estimate = report.estimator.estimate(frame, refine=refine)
         report.add(start_us, frame, estimate, 1000 * (time.perf_counter() - begun))
-        first_us = start_us if first_us is None else first_us
         if bar is not None and task is not None:
-            bar.update(task, advance=1, seconds=(start_us - first_us) / 1e6)
+            seconds += stream.step_us / 1e6
+            bar.update(task, advance=1, seconds=seconds)
 
 
 def _print_summary(console: Console, folder: Path, summary: dict[str, Any]) -> None:
     table = Table(title=str(folder), title_justify="left", show_header=False)
     half_widths = ", ".join(f"{name} {value:.4f}" for name, value in summary["mean_half_widths"].items())
     rows = {
+        "recording read as": summary["layout"],
         "windows": summary["windows"],
         "certified": summary["certified"],
         "no runway": summary["no_runway"],

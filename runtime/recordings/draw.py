@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -138,7 +138,10 @@ class Moment:
 
 
 class History:
-    """Moments in order of time, in constant memory: when there are too many, neighbours are joined."""
+    """Moments one after the other, in constant memory: when there are too many, neighbours are joined.
+
+    Each begins where the one before it ends, whatever its time: after a break of the camera's clock the picture goes on.
+    """
 
     def __init__(self) -> None:
         self.moments: list[Moment] = []
@@ -147,6 +150,9 @@ class History:
 
     def add(self, moment: Moment) -> None:
         """Takes the next moment."""
+        if self.moments:
+            start_us = self.moments[-1].stop_us
+            moment = replace(moment, start_us=start_us, stop_us=start_us + moment.stop_us - moment.start_us)
         if self._count % self._every:
             self.moments[-1] = self.moments[-1].joined(moment)
         else:
