@@ -24,19 +24,16 @@ from build_model.enclosure import columns_that_may_be_lit, columns_that_must_be_
 from build_model.pixel_mask import Runs, inset, paint, runs_of, widened
 from build_model.spatial_filter import reference_row, sliced, spatial_filter
 from build_model.window import Bits, Window
+from runtime.model.limits import SCALE_STEP, SMALLEST_LEVER_M
 from runtime.rounding import float32_above, float32_below, inverted
 from runtime.scene import STATE_NAMES, Camera, Scene, SceneError
 from runtime.state_set import StateSet, contract, scale_range, tangent_of_row
 
-SCALE_STEP = 2.0**-10
-"""Bins of the scale have borders on multiples of this, px per metre, so that they do not depend on the machine's libm."""
 LINE_COORDINATES = ("theta", "x", "scale", "z")
 HALVINGS, HALVING_ORDER = 12, ("scale", "x", "theta", "z")
 """How often an entry that would pass on any frame is halved, along which coordinates by turns, before the scene is refused."""
 MOST_WEAK = 4096
 """More weak entries than this in a cell are not halved: the scene asks for more than a bank of sensible size can give."""
-SMALLEST_LEVER_M = 1e-3
-"""A marking's distance from the camera's vertical plane counts as at least this when the bins of the scale are sized."""
 
 
 @dataclass(frozen=True)
@@ -105,12 +102,11 @@ def line_boxes(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float
 
 
 def _scale_bins(scene: Scene, x: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Intervals of the scale that cover `scale` (2,), each moving the outermost marking by at most `column_px`: (bins, 2)."""
+    """Intervals of the scale that cover `scale` (2,), above 0, each moving the outermost marking by at most `column_px`: (bins, 2)."""
     lever_m = max(np.abs(scene.runway.x_m[:, None] - x).max(), SMALLEST_LEVER_M)
     step = max(math.floor(scene.bank.column_px / lever_m / SCALE_STEP), 1) * SCALE_STEP
     edges = np.arange(math.floor(scale[0] / step), math.ceil(scale[1] / step) + 1) * step
-    if edges[0] == 0:
-        edges[0] = 2.0 ** (math.frexp(scale[0])[1] - 2)  # below every scale of the cell, and above 0, by which altitudes are divided
+    edges[0] = max(edges[0], 2.0 ** (math.frexp(scale[0])[1] - 2))  # a quarter to a half of the smallest scale, where the edge is 0
     return np.stack([edges[:-1], edges[1:]], axis=-1)
 
 

@@ -17,6 +17,8 @@ from runtime.camera import row_of_point
 from runtime.scene import Camera, Scene, SceneError
 from runtime.state_set import StateSet, contract, scale_range, tangent_of_row
 
+BELOW_HORIZON_PX = 1
+"""Least distance of a reference row from the horizon, px: twice what a loaded model must keep (`runtime.model.limits`)."""
 SLICES = 32
 """Slices of theta a cell. Eight times as many take less than one pixel in 100 from S of the paper's cells."""
 
@@ -28,13 +30,17 @@ def sliced(lower: float, upper: float, bins: int) -> NDArray[np.float64]:
 
 
 def reference_row(camera: Camera, lower: NDArray[np.float64], upper: NDArray[np.float64], middle_z_m: float) -> float:
-    """The row where the box's middle state sees the middle of the runway, rounded; every theta of the box sees ground there."""
+    """The row, rounded, where the box's middle state sees the middle of the runway, or the nearest one that bounds the scale well.
+
+    It lies in the frame, where the scale says what a pixel sees, and `BELOW_HORIZON_PX` or more below the horizon of every theta of the
+    box, so that no ratio of scales has a small divisor; on a frame that shows some theta no ground, that takes it below the frame.
+    """
     theta, _, y, z = (lower + upper) / 2
-    row = float(np.round(row_of_point(camera, theta, y, z + middle_z_m)))
+    row = float(row_of_point(camera, theta, y, z + middle_z_m))
     horizon = camera.v0 - camera.focal_px * np.tan(lower[0])
     if row <= horizon:
         raise SceneError(f"bank.pitch_bins: too few for theta in [{lower[0]:.4g}, {upper[0]:.4g}]; give more, or narrower cells")
-    return row
+    return max(float(np.clip(np.round(row), 0, camera.height)), float(np.ceil(horizon)) + BELOW_HORIZON_PX)
 
 
 def slice_cell(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64], slices: int = SLICES) -> StateSet:

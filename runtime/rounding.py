@@ -10,7 +10,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-OUTWARD_PX = 2.0**-20
+from runtime.scene import MARGIN_PX
+
+OUTWARD_PX = MARGIN_PX
 """Margin that every bound on a row or a column is widened by, in px."""
 
 ROUNDING_SHARE = 2.0**-46

@@ -34,6 +34,12 @@ FOCAL_RANGE_PX = (1.0, 1e6)
 """Focal lengths for which the margin of `runtime.rounding` covers float64's error."""
 LARGEST_PRINCIPAL_POINT_PX = 32768.0
 """Largest distance of the principal point from the frame's corner, per axis: twice the largest frame, for the same reason."""
+LARGEST_TOLERANCE_PX = 16
+MARGIN_PX = 2.0**-20
+"""What `runtime.rounding` widens every bound on a row or a column by, px; a scene whose own rounding comes near it is refused."""
+ROUNDED_SHARE_OF_COLUMN, ROUNDED_SHARE_OF_DISTANCE = 2.0**-51, 2.0**-52
+"""What float64 loses at most: on a column, of |u - u0| |v - v0| over the row's distance from the horizon, as the scale there is rounded
+(four units in the last place of 1); and on a distance, of the largest coordinate along the runway (two sums)."""
 LONGEST_FOUND = 200
 """Characters of a faulty value that an error quotes."""
 
@@ -249,7 +255,7 @@ class Tolerance:
     extra_budget: int = -1
 
     def __post_init__(self) -> None:
-        _demand(0 <= self.line_px <= 16, "tolerance.line_px", self.line_px, "give 0 to 16 px")
+        _demand(0 <= self.line_px <= LARGEST_TOLERANCE_PX, "tolerance.line_px", self.line_px, f"give 0 to {LARGEST_TOLERANCE_PX} px")
         _demand(0 <= self.missed_budget < 2**16, "tolerance.missed_budget", self.missed_budget, "give 0 or more pixels")
         _demand(-1 <= self.extra_budget < 2**31, "tolerance.extra_budget", self.extra_budget, "give 0 or more pixels, or -1: not used")
 
@@ -290,6 +296,28 @@ class Scene:
         widest = math.pi / 2 - SMALLEST_ANGLE_AHEAD_RAD
         ahead = -widest <= flattest and steepest <= widest
         _demand(ahead, "domain", "a state with the runway behind the camera (Z <= 0)", "narrow theta_rad, y_m or z_m")
+        self._check_margin(nearest, farthest)
+
+    def _check_margin(self, nearest: float, farthest: float) -> None:
+        """The margin of `runtime.rounding` is twice float64's error on rows and columns in view, or more. Raises `SceneError`.
+
+        An end is F y / (Z cos(theta)) px below the horizon. A point in view, r away from the camera, moves by no more than
+        ((u - u0)^2 + (v - v0)^2 + F^2) / (F r) px a metre along the runway.
+        """
+        camera, (low, high) = self.camera, (self.domain.lower, self.domain.upper)
+        across, down = (
+            max(abs(centre), abs(side - centre)) + LARGEST_TOLERANCE_PX
+            for side, centre in ((camera.width, camera.u0), (camera.height, camera.v0))
+        )
+        below_horizon_px = camera.focal_px * low[2] / math.hypot(high[2], farthest)
+        lost = ROUNDED_SHARE_OF_COLUMN * across * down / below_horizon_px
+        advice = "raise y_m, or end the runway or the domain nearer"
+        _demand(lost <= MARGIN_PX / 2, "domain", f"an end {below_horizon_px:.3g} px below the horizon, too near to round safely", advice)
+        largest = max(np.abs(self.runway.ends_z_m).max(), np.abs([low[3], high[3]]).max())
+        px_per_m = (camera.focal_px**2 + across**2 + down**2) / camera.focal_px / math.hypot(low[2], nearest)
+        found = f"coordinates along the runway of up to {largest:.3g} m where a metre spans up to {px_per_m:.3g} px"
+        lost = ROUNDED_SHARE_OF_DISTANCE * largest * px_per_m
+        _demand(lost <= MARGIN_PX / 2, "domain.z_m", found, "put the origin near the threshold, so that they round safely")
 
     @classmethod
     def load(cls, path: str | Path) -> Scene:

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from scenes import BARELY_ABOVE, BARELY_BELOW, CUT_LEFT, FREE_X, OFF_BY, PAPER, SHIFTED, THREE_MARKINGS, UNLIKE_MARKINGS, Floats, tolerant
 
-from build_model.hough_bank import SCALE_STEP, CellBank, LineBoxes, _scale_bins, cell_bank, line_boxes
+from build_model.hough_bank import CellBank, LineBoxes, _scale_bins, cell_bank, line_boxes
 from build_model.partition import partition
 from runtime.camera import ground_scale, project, project_points
 from runtime.image import image_of_ends, runway_image
+from runtime.model.limits import SCALE_STEP
 from runtime.rounding import OUTWARD_PX, inverted
 from runtime.scene import Axis, Camera, Scene, SceneError, Tolerance
 
@@ -105,6 +106,17 @@ def test_every_bin_of_the_scale_has_borders_that_any_machine_computes() -> None:
     for lower, upper in some_cells(PAPER):
         borders = line_boxes(PAPER, lower, upper).lower[:, 2] * 2**10
         assert (borders == np.round(borders)).all()
+
+
+def test_scales_are_above_0_where_a_bin_reaches_beyond_the_smallest() -> None:
+    """Far away a metre spans less than a bin, whose border at 0 would stand for the horizon."""
+    far = replace(PAPER.domain, theta_rad=Axis((0.01,), 0.0), y_m=Axis((5.0,), 1.0), z_m=Axis((300.0,), 10.0))
+    scene = replace(PAPER, domain=far)
+    lines = line_boxes(scene, far.lower, far.upper)
+    low, high = (float(ground_scale(scene.camera, 0.01, y, lines.reference_row[0])) for y in (5.5, 4.5))
+    assert high < PAPER.bank.column_px / 0.1
+    assert 0.25 * low <= lines.lower[:, 2].min() <= low
+    assert lines.upper[:, 2].max() >= high
 
 
 def test_the_papers_entries_must_light_thirty_pixels() -> None:

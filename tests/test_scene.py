@@ -15,10 +15,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from flint import arb, ctx  # pyright: ignore[reportMissingModuleSource]
 from hypothesis import given
 from hypothesis import strategies as st
 
-from runtime.camera import project
+from runtime.camera import ground_scale, project, row_of_point
+from runtime.rounding import OUTWARD_PX
 from runtime.scene import Axis, Bank, Calibration, Camera, Domain, EstimatorTraining, Marking, Runway, Scene, SceneError, Tolerance
 
 PAPER = Path(__file__).parents[1] / "models" / "paper.toml"
@@ -259,6 +261,55 @@ def test_the_runway_is_ahead_up_to_the_last_angle_and_no_farther() -> None:
 
     assert np.isfinite(project(Scene.from_dict(tables(-math.pi / 4 + 1e-5)), [-math.pi / 4 + 1e-5, 0, 1, 1])).all()
     assert "behind the camera" in refusal(tables(-math.pi / 4))
+
+
+def one_marking(camera: Camera, shift: float, ahead: float, length: float, y: float, theta: float) -> Scene:
+    """One state, `ahead` before a marking that starts at `shift`."""
+    theta_rad, x_m, y_m, z_m = (Axis((centre,), 0.0) for centre in (theta, 0.0, y, ahead - shift))
+    return Scene(camera, Runway((Marking("m", 1.0, shift, length),)), Domain(theta_rad, x_m, y_m, z_m), Bank(1, 1, 1.0))
+
+
+@given(
+    sides=st.tuples(st.integers(4, 14), st.integers(4, 14)),
+    focal=st.floats(0, 19.9),
+    logarithms=st.tuples(st.floats(-3, 6), st.floats(-5, 4), st.floats(-3, 6), st.floats(-6, 3)),
+    view=st.floats(-1, 1),
+    u_share=st.floats(0, 1),
+)
+def test_float64_keeps_half_the_margin_on_every_scene_that_is_taken(
+    sides: tuple[int, int], focal: float, logarithms: tuple[float, ...], view: float, u_share: float
+) -> None:
+    """Rows of ends, and columns by the scale at these rows, against 200 bits; scenes of any size, the far ones right at the horizon."""
+    width, height = (2**side for side in sides)
+    camera = Camera(width, height, 2**focal * 1e-5, 1e-5)
+    shift, ahead, length, y = (10.0**power for power in logarithms)
+    theta = math.atan2(y, ahead) - view * math.atan(height / 2 / camera.focal_px)
+    try:
+        scene = one_marking(camera, shift, ahead, length, y, theta)
+    except SceneError:
+        return
+    theta, _, y, z = scene.domain.lower.tolist()
+    with ctx.workprec(200):
+        focal_px, (sine, cosine) = arb(camera.focal_length_m) / arb(camera.pixel_pitch_m), arb(theta).sin_cos()
+        for end, d in zip(scene.runway.ends_z_m[0].tolist(), (arb(shift) + arb(z), arb(shift) + arb(length) + arb(z)), strict=True):
+            row = float(row_of_point(camera, theta, y, end + z))
+            if 0 <= row < height:
+                exact = arb(camera.v0) + focal_px * (arb(y) * cosine - d * sine) / (arb(y) * sine + d * cosine)
+                assert abs(exact - arb(row)) < OUTWARD_PX / 2
+                scale = focal_px * (sine + (arb(row) - arb(camera.v0)) / focal_px * cosine) / arb(y)
+                across = (u_share * width - camera.u0) / float(scale)
+                assert abs(arb(across) * scale - arb(across * float(ground_scale(camera, theta, y, row)))) < OUTWARD_PX / 2
+
+
+def test_what_float64_would_round_beyond_the_margin_is_refused() -> None:
+    camera = Camera(640, 480, 1.0, 1e-5)
+    assert one_marking(camera, 1e6, 100.0, 100.0, 1.0, 0.01).domain.lower[3] == 100 - 1e6
+    with pytest.raises(
+        SceneError, match=r"domain\.z_m: found coordinates along the runway of up to 1e\+06 m where a metre spans up to 7.07e\+08 px"
+    ):
+        one_marking(camera, 1e6, 1e-4, 1.0, 1e-4, math.pi / 4)
+    with pytest.raises(SceneError, match=r"domain: found an end 5\.33e-07 px below the horizon, too near"):
+        one_marking(Camera(640, 480, 8e-3, 15e-6), 0.0, 1.0, 1e6, 1e-3, 0.0)
 
 
 @pytest.mark.parametrize(

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from scenes import BARELY_ABOVE, BARELY_BELOW, CUT_BELOW, CUT_LEFT, FREE_X, PAPER, SHIFTED, THREE_MARKINGS, Floats, tolerant
 
 from build_model.partition import partition
-from build_model.spatial_filter import reference_row, sliced, spatial_filter, spatial_filters
+from build_model.spatial_filter import BELOW_HORIZON_PX, reference_row, sliced, spatial_filter, spatial_filters
 from build_model.window import Window
 from runtime.camera import project, row_of_point
 from runtime.image import image_of_ends, lit_columns, runway_image
-from runtime.scene import Axis, Scene, SceneError
+from runtime.scene import Axis, Camera, Scene, SceneError
 
 CASES = {"paper": PAPER, "three": THREE_MARKINGS, "cut left": CUT_LEFT, "cut below": CUT_BELOW, "free x": FREE_X}
 
@@ -110,6 +110,23 @@ def test_the_reference_row_is_where_the_middle_sees_the_runway() -> None:
         row = reference_row(PAPER.camera, lower, upper, 0.15)
         assert row == round(float(row_of_point(PAPER.camera, theta, y, z + 0.15)))
         assert row > PAPER.camera.v0 - PAPER.camera.focal_px * np.tan(lower[0])
+
+
+@given(theta=st.floats(-0.5, 1.4), width=st.floats(0, 0.1), y=st.floats(0.3, 300), z=st.floats(0.1, 3000), v0=st.floats(-1000, 1000))
+def test_the_reference_row_keeps_to_the_frame_and_off_the_horizon(theta: float, width: float, y: float, z: float, v0: float) -> None:
+    """It is the nearest row in the frame to the one where the runway is seen; a horizon there or below moves it down."""
+    camera = Camera(640, 480, 0.02, 1e-5, (320.0, v0))
+    lower, upper = np.array([theta, 0.0, y, z]), np.array([theta + width, 0.0, y, z])
+    seen = float(row_of_point(camera, theta + width / 2, y, z + 1))
+    horizon = v0 - camera.focal_px * np.tan(theta)
+    try:
+        row = reference_row(camera, lower, upper, 1.0)
+    except SceneError:
+        assert seen <= horizon
+        return
+    assert row >= 0
+    assert row - horizon >= BELOW_HORIZON_PX
+    assert row == np.clip(np.round(seen), 0, 480) or row - horizon < 2
 
 
 def test_a_box_that_has_the_horizon_below_its_runway_is_refused() -> None:

@@ -29,10 +29,11 @@ from build_model.filter_tables import FilterTables
 from build_model.hough_bank import CellBank, LineBoxes
 from build_model.pixel_mask import runs_of
 from build_model.verify.ball_camera import PRECISION_BITS, BallCamera, BallEntry, Ends, Slice, columns, columns_crossed
+from build_model.verify.box_claims import check_boxes
 from build_model.verify.cell_claim import cell_claims
 from build_model.verify.cell_proof import prove_cell
 from build_model.verify.cli import REFUTED, app
-from build_model.verify.counterexample import Counterexample
+from build_model.verify.counterexample import Counterexample, Refuted
 from build_model.verify.displacement import displacement_px
 from build_model.verify.model_graph import read_tables
 from build_model.verify.outputs import check_outputs
@@ -40,7 +41,7 @@ from build_model.verify.proof import axis_borders, cell_boxes, verify_model
 from build_model.window import Bits
 from runtime.camera import ground_scale, project, project_points
 from runtime.image import runway_image
-from runtime.model.format import METADATA_KEY, NETWORK_PREFIX, ModelError, metadata_digest
+from runtime.model.format import METADATA_KEY, NETWORK_PREFIX, PADDING_SIZE, ModelError, metadata_digest
 from runtime.scene import Axis, Bank, Calibration, Camera, Domain, Marking, Runway, Scene, Tolerance
 
 SCENE = Scene(
@@ -257,6 +258,50 @@ def shift_reference_row(rng: Rng, model: Model, cell: int) -> None:
     model.set_bank(cell, lines=LineBoxes(lines.lower, lines.upper, row))
 
 
+def some_entry(rng: Rng, model: Model, cell: int) -> int:
+    return int(rng.integers(len(model.banks[cell])))
+
+
+def move_reference_rows_away(rng: Rng, model: Model, cell: int) -> None:
+    """So far that no row tells scales apart any more, with scales that exclude nothing."""
+    lines = model.banks[cell].lines
+    lower, upper = lines.lower.copy(), lines.upper.copy()
+    lower[:, 2], upper[:, 2] = 1e-300, 1e300
+    model.set_bank(cell, lines=LineBoxes(lower, upper, np.full(len(lines), 1e16 * rng.choice([-1, 1]))))
+
+
+def move_reference_row_out_of_the_frame(rng: Rng, model: Model, cell: int) -> None:
+    lines = model.banks[cell].lines
+    row = lines.reference_row.copy()
+    row[some_entry(rng, model, cell)] = rng.choice([-1e-3, model.scene.camera.height + 1.001, np.nan, np.inf])
+    model.set_bank(cell, lines=LineBoxes(lines.lower, lines.upper, row))
+
+
+def unbind_scales(rng: Rng, model: Model, cell: int) -> None:
+    """An entry's scales reach beyond what its states have by more than a step."""
+    lines = model.banks[cell].lines
+    upper = lines.upper.copy()
+    upper[some_entry(rng, model, cell), 2] *= 1 + 10.0 ** rng.uniform(1, 290)
+    model.set_bank(cell, lines=LineBoxes(lines.lower, upper, lines.reference_row))
+
+
+def spoil_scales(rng: Rng, model: Model, cell: int) -> None:
+    lines = model.banks[cell].lines
+    lower, upper, entry = lines.lower.copy(), lines.upper.copy(), some_entry(rng, model, cell)
+    if rng.random() < 0.5:
+        lower[entry, 2] = rng.choice([0.0, -1.0, np.nan, np.nextafter(upper[entry, 2], np.inf)])
+    else:
+        upper[entry, 2] = rng.choice([np.inf, np.nan, np.nextafter(lower[entry, 2], 0)])
+    model.set_bank(cell, lines=LineBoxes(lower, upper, lines.reference_row))
+
+
+def invert_state_box(rng: Rng, model: Model, cell: int) -> None:
+    bank, entry, axis = model.banks[cell], some_entry(rng, model, cell), int(rng.integers(4))
+    lower, upper = bank.state_lower.copy(), bank.state_upper.copy()
+    lower[entry, axis], upper[entry, axis] = upper[entry, axis], lower[entry, axis]
+    model.set_bank(cell, state_lower=lower, state_upper=upper)
+
+
 def remove_entry(rng: Rng, model: Model, cell: int) -> None:
     entry, _ = random_state(rng, model, cell)
     bank = model.banks[cell]
@@ -436,6 +481,11 @@ MATHEMATICAL = {
     shift_line_box: "do not cover the cell|not in O|pixel of K|box of states",
     shift_line_boxes_in_pitch: "do not cover the cell|not in O|pixel of K|box of states",
     shift_reference_row: "do not cover the cell|not in O|pixel of K|box of states",
+    move_reference_rows_away: "reference_row is not near the frame",
+    move_reference_row_out_of_the_frame: "reference_row is not near the frame",
+    unbind_scales: "scales reach beyond those of its states",
+    spoil_scales: "scales are inverted, or not above 0 and finite",
+    invert_state_box: "box of states is inverted",
     remove_entry: "do not cover the cell",
     swap_cells: "do not cover the cell|box of states",
     swap_entries: "not in O|pixel of K",
@@ -539,6 +589,21 @@ def test_a_wrong_paper_model_is_refuted(
     proto = onnx.load(PAPER_TOML.with_suffix(".onnx"))
     model = Model(Scene.load(PAPER_TOML), list(paper_banks), proto, json.loads(proto.metadata_props[0].value))
     assert_refuted(model, tmp_path, mutate, claims, seed=4)
+
+
+def test_boxes_that_the_refinement_cannot_rely_on_are_refuted(model: Model) -> None:
+    """A camera that shows the horizon at the reference rows, and a domain that an entry leaves by float32's last place."""
+    tables = model.tables()
+    check_boxes(SCENE, tables)
+    rows = tables.reference_row[tables.must_light_size != PADDING_SIZE]
+    horizon = SCENE.camera.v0 - SCENE.camera.focal_px * np.tan(tables.state_lower[..., 0].max())
+    camera = replace(SCENE.camera, principal_point=(SCENE.camera.u0, SCENE.camera.v0 + float(rows.min() - horizon)))
+    with pytest.raises(Refuted, match="not certainly below the horizon of its states; cell 0; entry 0"):
+        check_boxes(replace(SCENE, camera=camera), tables)
+    upper = tables.state_upper.copy()
+    upper[-1, 0, 3] = np.nextafter(upper[..., 3].max(), np.float32(np.inf))
+    with pytest.raises(Refuted, match="reaches out of the domain; cell 1; entry 0"):
+        check_boxes(SCENE, replace(tables, state_upper=upper))
 
 
 def test_saving_without_a_mutation_changes_nothing(model: Model, tmp_path: Path) -> None:

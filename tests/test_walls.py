@@ -27,6 +27,7 @@ SHARED_WITH_VERIFIER = {
     "runtime.errors",
     "runtime.model",
     "runtime.model.format",
+    "runtime.model.limits",  # numbers
     "runtime.model.model_file",
     "runtime.model.onnx_subset",
     "runtime.model.protobuf",

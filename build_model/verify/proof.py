@@ -5,6 +5,7 @@ What is proved, and by what arithmetic:
     cells      the borders are the float64 numbers nearest to the scene's: exact fractions
     graph      NN_F is, node by node and bit by bit, the graph of the tables in the file (`build_model.verify.model_graph`); and on frames
                drawn at random, onnxruntime's outputs are those that the masks define, counted pixel by pixel: integers
+    boxes      of states, scales and reference rows are what the refinement takes for granted (`build_model.verify.box_claims`)
     sizes      |K|, its least value, the budgets' defaults and the stated assumptions agree: integers
     masks, boxes and cover of every cell (`build_model.verify.cell_proof`): Arb's balls of 64 bits, from the plain camera equations
     tolerance  line_px covers what the calibration can move a marking by (`build_model.verify.displacement`): Arb's balls
@@ -31,6 +32,7 @@ from google.protobuf.message import DecodeError
 from build_model.assumptions import assumptions
 from build_model.filter_tables import FilterTables
 from build_model.partition import Partition
+from build_model.verify.box_claims import check_boxes, demand_of_all
 from build_model.verify.cell_claim import cell_claims
 from build_model.verify.cell_proof import CellProof, prove_cell
 from build_model.verify.counterexample import Counterexample, Refuted, demand
@@ -161,6 +163,7 @@ def _check_all_but_masks(model: onnx.ModelProto, metadata: dict[str, Any], scene
     demand(least > scene.tolerance.missed_budget, f"the least |K|, {least}, does not exceed the missed budget")
     demand(metadata.get("assumptions") == assumptions(scene), "metadata: the assumptions are not the scene's")
     _check_whole_cells(model, cells, tables)
+    check_boxes(scene, tables)
     shift_px = displacement_px(scene, tables.window)
     demand(shift_px <= scene.tolerance.line_px, f"calibration: it can move a marking by {shift_px:.3f} px, more than line_px")
     stated = metadata.get("calibration_shift_px")
@@ -178,17 +181,9 @@ def _check_whole_cells(model: onnx.ModelProto, cells: Partition, tables: FilterT
     close = (cells.lower - lower <= slack) & (upper - cells.upper <= slack)
     for text, holds in (("does not hold the cell", within), ("is wider than rounding asks", close)):
         demand(bool(holds.all()), f"the box of a whole cell {text}", int(np.argmin(holds.all(axis=1))))
-    used, cell = (tables.must_light_size != PADDING_SIZE)[:, :, None], tables.row_cell
-    inside = ((tables.state_lower >= lower[cell][:, None]) & (tables.state_upper <= upper[cell][:, None])) | ~used
-    row, place = np.argwhere(~inside.all(axis=2))[0] if not inside.all() else (0, 0)
-    demand(bool(inside.all()), "an entry's box of states reaches out of its cell", *_entry(tables, int(row), int(place)))
-
-
-def _entry(tables: FilterTables, row: int, place: int) -> tuple[int, int]:
-    """Cell and number of the entry at a place of a row."""
-    cell = tables.row_cell[row]
-    before = row - int(np.searchsorted(tables.row_cell, cell))
-    return int(cell), before * tables.must_light_size.shape[1] + place
+    padding, cell = tables.must_light_size == PADDING_SIZE, tables.row_cell
+    inside = ((tables.state_lower >= lower[cell][:, None]) & (tables.state_upper <= upper[cell][:, None])).all(axis=2)
+    demand_of_all(padding | inside, "an entry's box of states reaches out of its cell", tables)
 
 
 def _cell_proofs(scene: Scene, tables: FilterTables, jobs: int) -> Iterator[CellProof | Counterexample]:
