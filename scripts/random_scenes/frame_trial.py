@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import statistics
 import time
 from collections import Counter
@@ -71,6 +72,7 @@ class FrameTrial:
             self.find(f"{type(error).__name__} in {raised_in(error)[0]}", f"{described(error)}, refine={refine}")
         finally:
             self.seconds = max(self.seconds, time.process_time() - start)
+        gc.collect()  # the exception and its frames, which hold the arrays of what took too much memory, refer to each other
         return None
 
     def find(self, fault: str, detail: str) -> None:
