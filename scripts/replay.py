@@ -22,15 +22,19 @@ from numpy.typing import NDArray
 
 from runtime import Estimate, Estimator, ModelError
 from runtime.errors import fail
-from runtime.frames import EventError, FrameStream
+from runtime.frames import LARGEST_GAP_US, EventError, FrameStream
 from runtime.recordings.recording import RecordingError, read_events
+from runtime.runs import LARGEST_STEP_BACK_US
 from runtime.scene import STATE_NAMES
 
 Packet = NDArray[Any]
 
 
 class Replay:
-    """Events in packets of `packet_us`, each handed over when its last event is due, `speed` times as fast as recorded."""
+    """Events in packets of `packet_us`, each handed over when its last event is due, `speed` times as fast as recorded.
+
+    Where time goes back, or on by more than a pause, the recording's clock broke: the next packet is due at once, and the pace goes on.
+    """
 
     def __init__(self, packets: Iterable[Packet], packet_us: int, speed: float) -> None:
         self._packets, self._packet_us, self._speed = packets, packet_us, speed
@@ -39,11 +43,15 @@ class Replay:
 
     def run(self, on_events: Callable[[Packet], None]) -> None:
         """Calls `on_events` with every packet, in order; a callback that takes too long delays the next one and loses nothing."""
-        begun = False
+        last_us: int | None = None
         for packet in _packets_of(self._packets, self._packet_us):
-            if not begun:
-                self._first_us, self._begun_s, begun = int(packet["t"][0]), time.monotonic(), True
-            due_s = self._begun_s + (int(packet["t"].max()) - self._first_us) / 1e6 / self._speed
+            latest_us = int(packet["t"].max())
+            if last_us is None:
+                self._first_us, self._begun_s = int(packet["t"][0]), time.monotonic()
+            elif not -LARGEST_STEP_BACK_US <= latest_us - last_us <= LARGEST_GAP_US:
+                self._first_us += latest_us - last_us
+            last_us = latest_us
+            due_s = self._begun_s + (latest_us - self._first_us) / 1e6 / self._speed
             time.sleep(max(0.0, due_s - time.monotonic()))
             on_events(packet)
 

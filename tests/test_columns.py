@@ -103,6 +103,12 @@ def test_arrays_that_are_no_events_are_refused(tmp_path, arrays, message):
         list(read_events(tmp_path / "a.npz"))
 
 
+def test_an_array_of_one_column_is_refused(tmp_path):
+    np.save(tmp_path / "a.npy", np.zeros(5))
+    with pytest.raises(RecordingError, match=r"no array t, x, y, p; .*found one array of shape \(5,\)"):
+        list(read_events(tmp_path / "a.npy"))
+
+
 def test_times_of_a_recording_with_one_wrong_time_keep_their_unit(tmp_path):
     """2**60 us would lie beyond the year 5000; one such time makes no file one of nanoseconds."""
     events = approach(start_us=1_605_537_493_718_345)

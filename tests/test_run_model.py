@@ -327,6 +327,17 @@ def test_a_replay_hands_over_every_event_when_it_is_due(events):
         assert packet["t"].max() - packet["t"].min() < 10_000
 
 
+def test_a_replay_waits_for_no_clock_that_breaks(events):
+    """One time in the far future would be awaited for days, and after a restart nothing would be awaited."""
+    part, got = events[events["t"] < 120_000], []
+    wrong = np.concatenate([part[:1000], part[:1], part[1000:], part])
+    wrong["t"][1000] = 2**50
+    begun = time.monotonic()
+    replay.Replay([wrong], 10_000, 2.0).run(got.append)
+    np.testing.assert_array_equal(np.concatenate(got), wrong)
+    assert 0.1 < time.monotonic() - begun < 30
+
+
 def test_a_live_estimator_gives_what_the_windows_give(events, estimator):
     got, stream = [], FrameStream((480, 640), 40_000, 20_000)
     live = replay.LiveEstimator(estimator, stream, lambda start_us, estimate: got.append((start_us, estimate)))

@@ -108,9 +108,10 @@ def test_more_lines_than_a_packet_are_read_as_the_first_ones_are(tmp_path, name)
         ("t,x,y,p\n1,2,3,1\n2,99999999999,3,1\n", r"line 3: .*x runs from 2 to 99999999999, beyond int32"),
         ("1,2,3,4,5\n", "found 5 columns without names; give a first line that names t, x, y, p"),
         ("1,2,3\n", "found 3 columns without names"),
+        ("0,5 1 2 1\n", "found 2 columns without names"),
         ("1000.25,1,2,0\n2000.75,1,2,0\n9000.25,1,2,0\n", "line 1 on: t has fractions, .*; name its unit, as in t_us"),
         ("t;x;y;p\n0,001;1;2;0\n", "line 2: found 0,001;1;2;0; give whole numbers"),
-        ("# only\n% comments\n\n", "no line of numbers or names in it"),
+        ("# only\n% comments\n\n", "no line of numbers or names within 1000 lines"),
         ("time,x,y\n", "no column p in the first line"),
     ],
 )

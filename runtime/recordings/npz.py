@@ -59,7 +59,7 @@ def packets(path: Path, notes: Notes) -> Iterator[NDArray[Any]]:
     tables = [array for array in arrays if array.dtype.names or (len(array.shape) == 2 and 4 in array.shape)]
     if len(tables) != 1:
         missing = ", ".join(name for name in "txyp" if name not in columns)
-        held = ", ".join(array.name for array in arrays) or "nothing"
+        held = ", ".join(array.name or f"one array of shape {array.shape}" for array in arrays) or "nothing"
         raise RecordingError(f"{path}: no array {missing}; the arrays t, x, y, p are needed, found {held}")
     return _table_packets(path, tables[0], notes)
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from runtime.recordings.columns import columns_of, order_of, packet_from, unit_of
 from runtime.recordings.header import shape_of
-from runtime.recordings.packet import PACKET_EVENTS, Notes, RecordingError
+from runtime.recordings.packet import EVENT, PACKET_EVENTS, Notes, RecordingError
 
 COMMENTS = ("#", "%")
 DELIMITERS = (";", "\t", ",")
@@ -76,13 +76,13 @@ def _layout(path: Path) -> Layout:
                 fields, delimiter = _fields(line)
                 if not NUMBER.fullmatch(fields[0]):
                     return _named(path, fields, delimiter, shape, number + 1)
-                if len(fields) == 2:
+                if len(fields) == 2 and shape_of(fields[1], fields[0]):
                     shape = shape_of(fields[1], fields[0])
                 elif len(fields) == 4:
                     return Layout(order, "", shape, delimiter, number)
                 else:
                     raise RecordingError(f"{path}: found {len(fields)} columns without names; give a first line that names t, x, y, p")
-    raise RecordingError(f"{path}: no line of numbers or names in it; give a line an event, t, x, y, p")
+    raise RecordingError(f"{path}: no line of numbers or names within {MOST_LINES_ABOVE} lines; give a line an event, t, x, y, p")
 
 
 def _fields(line: str) -> tuple[list[str], str | None]:
@@ -111,27 +111,49 @@ def _named(path: Path, names: list[str], delimiter: str | None, shape: tuple[int
 
 
 def _packets(path: Path, layout: Layout, notes: Notes) -> Iterator[NDArray[Any]]:
-    order, unit = ("txyp" if layout.columns else ""), layout.unit
+    reader = _Reader(layout, notes)
     with path.open(encoding="utf-8-sig", errors="replace") as file:
         numbered = itertools.islice(enumerate(file, start=1), layout.lines_above, None)
         while chunk := list(itertools.islice(numbered, PACKET_EVENTS)):
             lines = [(number, line) for number, line in chunk if line.strip() and not line.startswith(COMMENTS)]
-            rows, good, reason = _tried(len(lines), lambda count, lines=lines: _parsed(lines[:count], layout))
+            packet, fault = reader.read(lines)
+            yield packet
+            if fault:
+                raise RecordingError(f"{path}: {fault}")
+
+
+class _Reader:
+    """Takes lines, gives their events. What the lines above them do not tell, the first lines do."""
+
+    def __init__(self, layout: Layout, notes: Notes) -> None:
+        self._layout, self._notes = layout, notes
+        self._order = "txyp" if layout.columns else ""
+        self._unit = layout.unit
+
+    def read(self, lines: list[Line]) -> tuple[NDArray[Any], str]:
+        """The events of the lines before the first faulty one, and what is wrong with that; "" if none is faulty."""
+        rows, good, reason = _tried(len(lines), lambda count: _parsed(lines[:count], self._layout))
+        try:
             if good:
-                try:
-                    order = order or order_of(rows)
-                    columns = {name: rows[:, place] for place, name in enumerate(order)}
-                    unit = unit or unit_of(columns["t"])
-                except ValueError as error:
-                    raise RecordingError(f"{path}: from line {lines[0][0]} on: {error}") from error
-                notes.order, notes.unit = "" if layout.columns else order, unit
-                packet, good, wrong = _tried(good, lambda count, columns=columns, unit=unit: _events(columns, count, unit))
-                reason = wrong or reason
-                yield packet
-            if good < len(lines):
-                number, line = lines[good]
-                why = f" ({reason})" if reason else ""
-                raise RecordingError(f"{path}: line {number}: found {line.strip():.60}; give whole numbers t (us), x, y, p{why}")
+                self._tell(rows)
+        except ValueError as error:
+            return np.empty(0, dtype=EVENT), f"from line {lines[0][0]} on: {error}"
+        columns = {name: rows[:, place] for place, name in enumerate(self._order or "txyp")}
+        packet, good, wrong = _tried(good, lambda count: self._events(columns, count))
+        if good == len(lines):
+            return packet, ""
+        number, line = lines[good]
+        why = f" ({wrong or reason})" if wrong or reason else ""
+        return packet, f"line {number}: found {line.strip():.60}; give whole numbers t (us), x, y, p{why}"
+
+    def _tell(self, rows: NDArray[Any]) -> None:
+        """Finds out the columns' order and the times' unit, where they are not known. Raises ValueError."""
+        self._order = self._order or order_of(rows)
+        self._unit = self._unit or unit_of(rows[:, self._order.index("t")])
+        self._notes.order, self._notes.unit = "" if self._layout.columns else self._order, self._unit
+
+    def _events(self, columns: dict[str, NDArray[Any]], count: int) -> NDArray[Any]:
+        return packet_from({name: column[:count] for name, column in columns.items()}, self._unit or "us")
 
 
 def _tried(count: int, attempt: Callable[[int], NDArray[Any]]) -> tuple[NDArray[Any], int, str]:
@@ -150,10 +172,6 @@ def _tried(count: int, attempt: Callable[[int], NDArray[Any]]) -> tuple[NDArray[
             faulty, reason = trial, str(error)
         trial = (good + faulty) // 2
     return attempt(0) if given is None else given, good, reason
-
-
-def _events(columns: dict[str, NDArray[Any]], count: int, unit: str) -> NDArray[Any]:
-    return packet_from({name: column[:count] for name, column in columns.items()}, unit)
 
 
 def _parsed(lines: list[Line], layout: Layout) -> NDArray[Any]:
