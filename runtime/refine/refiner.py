@@ -47,23 +47,27 @@ class Search:
     """How the entries are cut: all of them at first, then in rounds the pieces that carry a face of the box around what is left."""
 
     first: int
-    """Slices of theta that every entry is cut into."""
+    """Slices of theta that every entry is cut into, at most."""
     theta: int
     z: int
     scale: int
     """Parts that a piece which carries a face is cut into along each interval."""
     pieces: int
-    """How many pieces a face."""
+    """How many pieces a face, at most."""
     rounds: int
     gain: float
     """At most so many rounds, and until one takes less than this share from every side of the box."""
 
 
+FACES = 6
+"""Of the box in theta, y and z that is searched."""
 NONE_MISSED = Search(first=4, theta=4, z=2, scale=1, pieces=2, rounds=8, gain=0.02)
 SOME_MISSED = Search(first=4, theta=3, z=2, scale=2, pieces=4, rounds=20, gain=0.02)
 """Missed pixels are counted where windows are a pixel or two wide (`missed`): then smaller pieces pay, cut along the scale too."""
 LARGEST_START = 512
 """More passing entries than this say that the frame tells next to nothing: they are left as they are, at a bounded cost."""
+LARGEST_ROUND = 2**18
+"""Rows of markings that a round looks at, about: where each set shows very many, fewer pieces are cut, and less finely at first."""
 LARGEST_BLOCK = 2**19
 """Sets are contracted so many at once that their markings have no more rows than this between them: memory is bounded."""
 
@@ -88,10 +92,13 @@ class Refiner:
         witnesses = LitPixels.of(frame, self.window, beyond=True)
         claims = None if claimed is None else Claims(LitPixels.of(claimed, self.window, beyond=False), self.extra_budget)
         search = NONE_MISSED if self.missed_budget == 0 else SOME_MISSED
-        pieces = self._contracted(witnesses, claims, _cut(entries, theta=search.first))
+        most_sets = LARGEST_ROUND // (len(self.scene.runway.markings) * len(witnesses.canvas))
+        slices = min(max(most_sets // max(len(entries), 1), 1), search.first)
+        a_face = min(max(most_sets // (FACES * search.theta * search.z * search.scale), 1), search.pieces)
+        pieces = self._contracted(witnesses, claims, _cut(entries, theta=slices))
         extent = _extent(pieces)
         for _ in range(search.rounds if len(pieces) else 0):
-            outer = _carries_a_face(pieces, search.pieces)
+            outer = _carries_a_face(pieces, a_face)
             finer = self._contracted(witnesses, claims, _cut(pieces[outer], theta=search.theta, z=search.z, scale=search.scale))
             pieces, before = joined(finer, pieces[~outer]), extent
             extent = _extent(pieces)
