@@ -126,7 +126,7 @@ def into_domain(stage: Stage, state: RationalState) -> RationalState:
 def some_free_axes(rng: Rng, stage: Stage) -> list[int]:
     """One or more of the axes that have a width."""
     free = [axis for axis, sides in enumerate(stage.scene.domain.axes) if sides.width > 0]
-    return rng.choice(free, size=rng.integers(1, len(free) + 1), replace=False).tolist()
+    return rng.choice(free, size=rng.integers(1, len(free) + 1), replace=False).tolist() if len(free) else []
 
 
 def moved(state: RationalState, axis: int, to: Fraction) -> RationalState:
