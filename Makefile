@@ -42,6 +42,7 @@ evidence: out/paper.onnx
 	$(BIN)/python -m pytest --hypothesis-profile=long
 	$(BIN)/python scripts/fuzz.py $< --minutes 10 -o out/fuzz
 	$(BIN)/python scripts/coverage $< --frames 24000 -o out/coverage.json
+	$(BIN)/python scripts/random_scenes -o out/random_scenes.json
 
 clean:
 	rm -rf .venv out dist build .pytest_cache .ruff_cache .hypothesis

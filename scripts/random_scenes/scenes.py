@@ -20,7 +20,7 @@ from runtime.camera import ground_scale, project, row_of_point
 from runtime.scene import Axis, Bank, Calibration, Domain, EstimatorTraining, Marking, Runway, Scene, SceneError, Tolerance
 
 FARTHEST_SHIFT_M = 1e5
-MOST_CELLS = 81
+MOST_CELLS, MOST_OF_AN_AXIS = 81, 3
 MOST_ENTRIES = 2000
 MOST_PAINTED = 3e8
 """Limit on the pixels that a bank paints, in all slices and entries: a second or two."""
@@ -180,14 +180,15 @@ def draw_plan(rng: Rng, sight: Sight) -> Plan:
         ends = reach / rates.ends
     altitude_step = sight.outlook.y * column_px / (rates.lever * rates.reference_scale)
     steps = [min(turned / max(rates.line, 1e-12), ends[0]), lateral_px / rates.reference_scale, min(altitude_step, ends[1]), ends[2]]
-    fixed = rng.random(4) < (0.12, 0.6, 0.2, 0.15)
+    counts = np.array([1, 1, 1, 1] if sight.few_sets else draw_counts(rng))
+    fixed = (rng.random(4) < (0.12, 0.6, 0.2, 0.15)) & (counts < MOST_OF_AN_AXIS)
     width = rng.choice([0.1, 1.0, 10.0], 4, p=[0.25, 0.55, 0.2]) ** rng.uniform(0, 1, 4)
     return Plan(
         steps=np.array(steps),
         limits=widest(sight, rates),
         shares=np.where(fixed, 0.0, width),
         bins=np.where(fixed, 1, rng.integers(1, FEW_BINS if sight.few_sets else MANY_BINS)).astype(float),
-        counts=np.where(fixed | sight.few_sets, 1, draw_counts(rng)).astype(float),
+        counts=np.where(fixed, 1, counts).astype(float),
         column_px=column_px,
         lateral_px=lateral_px,
     )
@@ -195,10 +196,12 @@ def draw_plan(rng: Rng, sight: Sight) -> Plan:
 
 def draw_counts(rng: Rng) -> list[int]:
     """Cells on each axis, 1 to 81 in all, few more often than many."""
-    most = int(rng.choice([1, 4, 9, 27, MOST_CELLS], p=[0.5, 0.22, 0.14, 0.08, 0.06]))
+    most = int(rng.choice([1, 4, 9, 27, MOST_CELLS], p=[0.5, 0.22, 0.14, 0.1, 0.04]))
+    if most == MOST_CELLS:
+        return [MOST_OF_AN_AXIS] * 4
     counts = [1, 1, 1, 1]
     for axis in rng.permutation(4).tolist() * 2:
-        counts[axis] *= int(rng.integers(1, min(most // math.prod(counts), 3) + 1))
+        counts[axis] *= int(rng.integers(1, min(most // math.prod(counts), MOST_OF_AN_AXIS) + 1))
     return counts
 
 

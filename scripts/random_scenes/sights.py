@@ -268,7 +268,7 @@ def draw_camera(rng: Rng) -> Camera:
     off = rng.choice([0.0, 0.3, 1.5], p=[0.5, 0.35, 0.15])
     if off == 0.0:
         return camera
-    u0, v0 = (side / 2 + side * off * rng.uniform(-1, 1) for side in (width, height))
+    u0, v0 = (side / 2 + side * float(off) * rng.uniform(-1, 1) for side in (width, height))
     return replace(camera, principal_point=(u0, v0))
 
 

@@ -57,7 +57,7 @@ class Trial:
             built = self.first_built(Path(folder) / "model.onnx", outcomes)
             if built is not None:
                 self.judge_frames(built, range(self.frames), outcomes)
-                if self.scene % PROVED_EVERY == 0:
+                if (self.scene + 1) % PROVED_EVERY == 0:
                     self.prove(built, outcomes)
         return outcomes
 
