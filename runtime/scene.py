@@ -201,12 +201,8 @@ class Domain:
         for field, axis in zip(dataclasses.fields(self), self.axes, strict=True):
             axis.check(f"domain.{field.name}")
         low, high = self.lower, self.upper
-        _demand(
-            low[0] > -math.pi / 2 and high[0] < math.pi / 2,
-            "domain.theta_rad",
-            [float(low[0]), float(high[0])],
-            "stay within -pi/2 and pi/2",
-        )
+        pitches = [float(low[0]), float(high[0])]
+        _demand(low[0] > -math.pi / 2 and high[0] < math.pi / 2, "domain.theta_rad", pitches, "stay within -pi/2 and pi/2")
         _demand(low[2] >= SMALLEST_EXTENT, "domain.y_m", low[2], "the camera must be above the runway: y > 0 throughout")
 
     @property
