@@ -7,9 +7,11 @@ PYTHON ?= python3
 PIP_EXTRA ?=
 BIN := .venv/bin
 INSTALLED := .venv/installed
+LOWEST := .venv-lowest/bin
+LOWEST_INSTALLED := .venv-lowest/installed
 SOURCES := $(shell find build_model runtime -name "*.py")
 
-.PHONY: setup test lint types demo evidence clean
+.PHONY: setup setup-lowest test test-lowest lint types demo evidence clean
 .DELETE_ON_ERROR:
 
 setup: $(INSTALLED)
@@ -18,6 +20,19 @@ $(INSTALLED): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet $(PIP_EXTRA) --constraint constraints.txt --editable '.[dev]'
 	touch $@
+
+# A second environment with the lowest versions that pyproject.toml admits, each with the newest of what it needs itself.
+setup-lowest: $(LOWEST_INSTALLED)
+
+$(LOWEST_INSTALLED): pyproject.toml scripts/lowest_versions.py
+	$(PYTHON) -m venv .venv-lowest
+	$(LOWEST)/python scripts/lowest_versions.py > .venv-lowest/lowest.txt
+	$(LOWEST)/python -m pip install --quiet $(PIP_EXTRA) --constraint .venv-lowest/lowest.txt --editable '.[dev]'
+	touch $@
+
+# onnx's converter between operator sets, and onnxruntime of that age, do not know all that the parity tests convert to.
+test-lowest: $(LOWEST_INSTALLED)
+	$(LOWEST)/python -m pytest -k "not other_operator_sets"
 
 test: lint types
 	$(BIN)/python -m pytest
@@ -36,7 +51,7 @@ out/paper.onnx: models/paper.toml constraints.txt $(SOURCES) | $(INSTALLED)
 	mkdir -p $(@D)
 	$(BIN)/export-model $< -o $@
 
-evidence: out/paper.onnx
+evidence: out/paper.onnx test-lowest
 	$(BIN)/verify-model $<
 	$(BIN)/python -m pytest -m evidence
 	$(BIN)/python -m pytest --hypothesis-profile=long
@@ -45,5 +60,5 @@ evidence: out/paper.onnx
 	$(BIN)/python scripts/random_scenes -o out/random_scenes.json
 
 clean:
-	rm -rf .venv out dist build .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv .venv-lowest out dist build .pytest_cache .ruff_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

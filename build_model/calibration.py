@@ -14,7 +14,7 @@ import math
 
 from build_model.window import Window
 from runtime.rounding import above
-from runtime.scene import Scene, SceneError
+from runtime.scene import LARGEST_LINE_PX, Scene, SceneError
 
 
 def displacement_px(scene: Scene, window: Window) -> float:
@@ -54,8 +54,9 @@ def check_calibration(scene: Scene, window: Window) -> float:
     shift = displacement_px(scene, shown)
     needed = math.ceil(shift)
     if needed > scene.tolerance.line_px:
-        raise SceneError(
-            f"tolerance.line_px: found {scene.tolerance.line_px}, but [calibration] can move the markings by {shift:.2f} px; "
-            f"give {needed} or more, or a smaller [calibration]"
-        )
+        moved = f"found {scene.tolerance.line_px}, but [calibration] can move the markings by {shift:.2f} px"
+        if needed > LARGEST_LINE_PX:
+            limit = f"more than the largest line_px, {LARGEST_LINE_PX}"
+            raise SceneError(f"tolerance.line_px: {moved}, {limit}; give at most {LARGEST_LINE_PX / shift:.2f} of its plus-minus")
+        raise SceneError(f"tolerance.line_px: {moved}; give {needed} or more, or a smaller [calibration]")
     return shift

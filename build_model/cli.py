@@ -9,17 +9,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from build_model.assumptions import assumptions
+from runtime import terminal
 from runtime.errors import INTERRUPTED, fail
 
 if TYPE_CHECKING:
     from types import FrameType
+
+    from rich.console import Console
 
     from build_model.export import ExportReport
     from runtime.scene import Scene
 
 try:
     import typer
-    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
     from rich.table import Table
 except ImportError as error:
@@ -30,7 +32,7 @@ DEFAULT_SCENE = Path("models/paper.toml")
 
 def export_model(
     scene: Annotated[Path, typer.Argument(help="Scene file (TOML).")] = DEFAULT_SCENE,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="Model to write; by default the scene's name in out/.")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Model to write, or its folder; by default out/.")] = None,
     estimator: Annotated[Path | None, typer.Option(help="Your own NN_e: float32 [1,1,height,width] to [1,4].")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the training.")] = 0,
     jobs: Annotated[int, typer.Option(min=1, help="Processes that build cells.")] = 2,
@@ -39,8 +41,10 @@ def export_model(
     ] = None,
 ) -> None:
     """Build NN_F from the scene, train NN_e (or take yours), and write one ONNX file with both."""
-    target = output or Path("out") / f"{scene.stem}.onnx"
-    console = Console()
+    target = output or Path("out")
+    if output is None or output.is_dir():
+        target /= f"{scene.stem}.onnx"
+    console = terminal.console()
     with _interrupts_end_in_a_line(target):
         loaded, report = _export(console, scene, target, estimator=estimator, seed=seed, jobs=jobs, dask=dask)
     _print_summary(console, loaded, target, report)
@@ -48,7 +52,7 @@ def export_model(
 
 @contextmanager
 def _interrupts_end_in_a_line(target: Path) -> Iterator[None]:
-    """Ends the command with one line and exit code 130 on Ctrl-C.
+    """Ends the command with one line and exit code 130 on Ctrl-C, or on a signal that `runtime.terminal` takes for it.
 
     What ends the block after the signal is taken for its consequence: an import of torch's that it breaks off ends in an error of another
     class. A signal that is ignored, as in a background job of a shell, stays so.
@@ -64,8 +68,8 @@ def _interrupts_end_in_a_line(target: Path) -> Iterator[None]:
         signal.signal(signal.SIGINT, note)
     try:
         yield
-    except BaseException:
-        if not seen:
+    except BaseException as end:
+        if not seen and not isinstance(end, KeyboardInterrupt):
             raise
         fail(f"{target}: interrupted; the model that was there before is untouched", INTERRUPTED)
     finally:
@@ -127,9 +131,9 @@ def _print_summary(console: Console, scene: Scene, target: Path, report: ExportR
         console.print(report.training.table())
     console.print("The certificate assumes:")
     for line in assumptions(scene):
-        console.print(f"  - {line}", highlight=False, markup=False)
+        console.print(f"  - {line}", highlight=False)
 
 
 def export_model_command() -> None:
     """Entry point of `export-model`."""
-    typer.run(export_model)
+    terminal.run(export_model)

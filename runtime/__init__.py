@@ -6,6 +6,7 @@
 Conventions: `runtime.camera`. What is guaranteed: `runtime.estimator` and docs/guarantee.md.
 """
 
+from runtime import offline  # noqa: F401  first
 from runtime.estimate import Box, Estimate, FrameError, Outcome
 from runtime.estimator import Estimator
 from runtime.frames import EventError, FrameStream, events_to_frames

@@ -17,6 +17,9 @@ class FrameError(ValueError):
         self.actual = actual
         self.expected = expected
 
+    def __reduce__(self) -> tuple[type[FrameError], tuple[str, str]]:
+        return FrameError, (self.actual, self.expected)  # not the message alone, of which an exception is copied otherwise
+
 
 class Outcome(enum.Enum):
     """What a frame says: CERTIFIED, a box is given; NO_RUNWAY, no state of the domain is consistent with it."""

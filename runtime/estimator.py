@@ -10,6 +10,7 @@ lies in the scene's domain, the camera is the scene's (no roll or yaw, the calib
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
@@ -35,7 +36,7 @@ REFINED_BEYOND_PX = 2
 
 
 class Estimator:
-    """A loaded model. Not thread-safe; give each thread its own."""
+    """A loaded model. Not thread-safe; give each thread its own, for example a `copy.copy`."""
 
     def __init__(self, model: ModelFile, name: str, threads: int, missed_budget: int | None, extra_budget: int | None) -> None:
         self.metadata: dict[str, Any] = model.metadata
@@ -54,7 +55,29 @@ class Estimator:
         self._fixed = self._domain.lower == self._domain.upper
         window = self._entries.window_and_beyond(REFINED_BEYOND_PX)
         self._refiner = Refiner(self.scene, int(self._budgets["missed_budget"]), int(self._budgets["extra_budget"]), window)
-        self._arguments = {"path": name, "missed_budget": missed_budget, "extra_budget": extra_budget, "sha256": self.sha256}
+        # The file's absolute path: whoever reads it again may do so after a change of folder.
+        budgets = {"missed_budget": missed_budget, "extra_budget": extra_budget}
+        self._arguments = {"path": os.path.abspath(name), **budgets, "sha256": self.sha256}
+        self._name, self._threads = name, threads
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy, or what another process unpickles, reads the model's file again; raises `ModelError` if that has gone or changed."""
+        return partial(Estimator.load, threads=self._threads, **self._arguments), ()
+
+    @property
+    def missed_budget(self) -> int:
+        """m of Theorem A: pixels of the runway's image that may be dark."""
+        return int(self._budgets["missed_budget"])
+
+    @property
+    def extra_budget(self) -> int:
+        """e of Theorem B, or -1 where it is not used."""
+        return int(self._budgets["extra_budget"])
+
+    @property
+    def largest_missed_budget(self) -> int:
+        """The largest that `load` takes: one below the smallest |K| of the model's entries."""
+        return self.metadata["smallest_must_light"] - 1
 
     @classmethod
     def load(
@@ -91,7 +114,7 @@ class Estimator:
         try:
             return dict(zip(OUTPUTS, self._session.run(OUTPUTS, {"frame": pixels, **self._budgets}), strict=True))
         except Exception as error:  # onnxruntime raises classes of its own that share only this one
-            raise ModelError(f"{self._arguments['path']}: onnxruntime cannot run it ({reason_of(error)}); export it again") from error
+            raise ModelError(f"{self._name}: onnxruntime cannot run it ({reason_of(error)}); export it again") from error
 
     def estimate(self, frame: NDArray, proposal: ArrayLike | None = None, refine: bool = True) -> Estimate:
         """State and certified box of one frame.
@@ -124,6 +147,15 @@ class Estimator:
             regions=regions,
             touches_boundary=box is not None and self._touches_boundary(box),
         )
+
+    def entries_within(self, frame: NDArray, missed_budget: int) -> StateSet:
+        """The bank's entries of whose pixels K at most so many are dark: at another budget than the model's, no certificate of anything.
+
+        Raises `FrameError` as `estimate` does.
+        """
+        budgets = {"missed_budget": np.array(missed_budget, dtype=np.int32), "extra_budget": np.array(-1, dtype=np.int32)}
+        (passes,) = self._session.run(["passes"], {"frame": self._checked_frame(frame), **budgets})
+        return self._entries.sets(np.asarray(passes))
 
     def estimate_many(self, frames: Iterable[NDArray], refine: bool = True, processes: int = 2) -> Iterator[Estimate]:
         """`estimate` of every frame, in order, on several cores: the same answers to the last bit.

@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 
 STATE_NAMES = ("theta", "x", "y", "z")
 STATE_UNITS = ("rad", "m", "m", "m")
+STATE_COLUMNS = tuple(f"{name}_{unit}" for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True))
+"""Names of a state's numbers in tables."""
 TILING_TOLERANCE = 1e-9
 """Largest gap or overlap between neighbouring cells, in the axis's unit, that is read as decimal rounding in the file."""
 SMALLEST_EXTENT = 1e-6
@@ -34,7 +36,8 @@ FOCAL_RANGE_PX = (1.0, 1e6)
 """Focal lengths for which the margin of `runtime.rounding` covers float64's error."""
 LARGEST_PRINCIPAL_POINT_PX = 32768.0
 """Largest distance of the principal point from the frame's corner, per axis: twice the largest frame, for the same reason."""
-LARGEST_TOLERANCE_PX = 16
+LARGEST_LINE_PX = 16
+"""Largest tolerance, px: beyond it a frame of clutter witnesses every line."""
 MARGIN_PX = 2.0**-20
 """What `runtime.rounding` widens every bound on a row or a column by, px; a scene whose own rounding comes near it is refused."""
 ROUNDED_SHARE_OF_COLUMN, ROUNDED_SHARE_OF_DISTANCE = 2.0**-51, 2.0**-52
@@ -256,7 +259,7 @@ class Tolerance:
     extra_budget: int = -1
 
     def __post_init__(self) -> None:
-        _demand(0 <= self.line_px <= LARGEST_TOLERANCE_PX, "tolerance.line_px", self.line_px, f"give 0 to {LARGEST_TOLERANCE_PX} px")
+        _demand(0 <= self.line_px <= LARGEST_LINE_PX, "tolerance.line_px", self.line_px, f"give 0 to {LARGEST_LINE_PX} px")
         _demand(0 <= self.missed_budget < 2**16, "tolerance.missed_budget", self.missed_budget, "give 0 or more pixels")
         _demand(-1 <= self.extra_budget < 2**31, "tolerance.extra_budget", self.extra_budget, "give 0 or more pixels, or -1: not used")
 
@@ -307,7 +310,7 @@ class Scene:
         """
         camera, (low, high) = self.camera, (self.domain.lower, self.domain.upper)
         across, down = (
-            max(abs(centre), abs(side - centre)) + LARGEST_TOLERANCE_PX
+            max(abs(centre), abs(side - centre)) + LARGEST_LINE_PX
             for side, centre in ((camera.width, camera.u0), (camera.height, camera.v0))
         )
         below_horizon_px = camera.focal_px * low[2] / math.hypot(high[2], farthest)

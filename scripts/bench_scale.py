@@ -10,6 +10,7 @@ cost does not depend on the cells, is trained for one epoch only.
 from __future__ import annotations
 
 import csv
+import io
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -20,13 +21,14 @@ import cv2
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.table import Table
 
 from build_model.export import export_model
-from runtime import Estimator, Scene
+from runtime import Estimator, Scene, terminal
 from runtime.recordings.bench import cluttered_frames, machine
+from runtime.recordings.draw import png
 from runtime.scene import Axis, Bank, Domain, EstimatorTraining
+from runtime.whole_file import write_whole
 
 CLUTTER = 0.02
 QUICK = EstimatorTraining(training_frames=256, epochs=1)
@@ -145,7 +147,7 @@ def main(
 ) -> None:
     """Build every scene, time it, print the table."""
     output.mkdir(parents=True, exist_ok=True)
-    console = Console(width=140)
+    console = terminal.console(140)
     clock = time.thread_time if cpu_time else time.perf_counter
     reports, paths = [], []
     for family, chosen in scenes(Scene.load(scene)):
@@ -163,13 +165,14 @@ def main(
         sizes.append(Size(family, *size, float(np.median(times)), ratio, estimate_ms, passing))
     header = {**machine(), "clock": clock.__name__}
     console.print(", ".join(f"{name} {value}" for name, value in header.items()), table(sizes), highlight=False)
-    with (output / "scale.csv").open("w", newline="", encoding="utf-8") as file:
-        file.writelines(f"# {name}: {value}\n" for name, value in header.items())
-        writer = csv.writer(file)
-        writer.writerow(Size.__dataclass_fields__)
-        writer.writerows(vars(size).values() for size in sizes)
-    cv2.imwrite(str(output / "scale.png"), plot(sizes))
+    text = io.StringIO()
+    text.writelines(f"# {name}: {value}\n" for name, value in header.items())
+    writer = csv.writer(text)
+    writer.writerow(Size.__dataclass_fields__)
+    writer.writerows(vars(size).values() for size in sizes)
+    write_whole(output / "scale.csv", text.getvalue().encode())
+    write_whole(output / "scale.png", png(plot(sizes)))
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    terminal.run(main)

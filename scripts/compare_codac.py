@@ -40,11 +40,10 @@ import numpy as np
 import typer
 from comparison_frames import draw_frames, write_csv
 from numpy.typing import ArrayLike, NDArray
-from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from runtime import Estimator, ModelError, Scene
+from runtime import Estimator, ModelError, Scene, terminal
 from runtime.errors import fail
 from runtime.image import lit_columns
 from runtime.rounding import above, below
@@ -400,7 +399,7 @@ def main(
     seed: Annotated[int, typer.Option(min=0, help="Seed of states and clutter.")] = 1,
 ) -> None:
     """Compare widths and times, print the table and write the CSV; exit code 1 if a box lacks the truth."""
-    errors = Console(stderr=True)
+    errors = terminal.console(stderr=True)
     try:
         estimator = Estimator.load(model)
         inversion = SetInversion(estimator.scene)
@@ -412,11 +411,11 @@ def main(
         drawn = draw_frames(estimator.scene, frames, density, seed)
         for truth, frame in track(drawn, f"clutter {density:.0%}", total=frames, console=errors, transient=True):
             results.append(compare(estimator, inversion, truth, frame, density, size))
-    Console(width=170).print(table_of(results, size))
+    terminal.console(170).print(table_of(results, size))
     write_csv(output, HEADER, [figures_of(result) for result in results])
     if any(result.violations for result in results):
         raise typer.Exit(1)
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    terminal.run(main)

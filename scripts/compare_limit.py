@@ -21,11 +21,11 @@ import typer
 from comparison_frames import draw_frames, write_csv
 from consistent_states import Extent, Sampler
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from runtime import Box, Estimator, ModelError, Scene, SceneError
+from runtime import Box, Estimator, ModelError, Scene, SceneError, terminal
+from runtime.errors import fail
 from runtime.image import runway_image
 from runtime.scene import STATE_NAMES
 
@@ -161,15 +161,14 @@ def main(
     seed: Annotated[int, typer.Option(min=0, help="Seed of states, clutter, missed pixels and sampling.")] = 1,
 ) -> None:
     """Compare the certified box with the states that the frame allows, print the table and write the CSV."""
-    errors = Console(stderr=True)
+    errors = terminal.console(stderr=True)
     dark = missed_budget if missed is None else missed
     try:
         if dark > missed_budget:
             raise ValueError(f"--missed: found {dark}, expected at most the budget, {missed_budget}; raise --missed-budget")
         estimator = loaded(model, missed_budget)
     except (ModelError, SceneError, ValueError) as error:
-        errors.print(str(error), markup=False, soft_wrap=True)
-        raise typer.Exit(2) from error
+        fail(error)
     drawn = frames_with_missed(estimator.scene, frames, clutter, dark, seed)
     results = [
         compare(estimator, truth, frame, missed_budget, [seed, 3, number])
@@ -177,7 +176,7 @@ def main(
     ]
     violations, unfinished = sum(result.violated for result in results), sum(not result.extent.converged for result in results)
     title = f"{estimator.scene.domain.cell_count} cells, {clutter:.0%} clutter, m = {missed_budget}, {dark} missed, {frames} frames"
-    console = Console(width=140)
+    console = terminal.console(140)
     if any(result.box is not None for result in results):
         console.print(table_of(results, title))
     console.print(f"boxes that lack a consistent state: {violations}; samples that still grew after the last round: {unfinished}")
@@ -187,4 +186,4 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    terminal.run(main)

@@ -38,11 +38,10 @@ import numpy as np
 import typer
 from comparison_frames import draw_frames, write_csv
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from runtime import Estimator, ModelError, Scene
+from runtime import Estimator, ModelError, Scene, terminal
 from runtime.camera import ground_scale, project, row_of_point
 from runtime.errors import fail
 
@@ -370,7 +369,7 @@ def main(
 ) -> None:
     """Compare errors and times, print the table and write the CSV."""
     cv2.setNumThreads(1)
-    errors = Console(stderr=True)
+    errors = terminal.console(stderr=True)
     try:
         estimator = Estimator.load(model)
         baseline = Baseline(estimator.scene)
@@ -381,9 +380,9 @@ def main(
         drawn = draw_frames(estimator.scene, frames, density, seed)
         for truth, frame in track(drawn, f"clutter {density:.0%}", total=frames, console=errors, transient=True):
             answers.extend(answers_of(estimator, baseline, truth, frame, density))
-    Console(width=150).print(table_of(answers))
+    terminal.console(150).print(table_of(answers))
     write_csv(output, HEADER, [figures_of(answer) for answer in answers])
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    terminal.run(main)

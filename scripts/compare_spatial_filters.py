@@ -22,7 +22,6 @@ from typing import Annotated
 import numpy as np
 import typer
 from numpy.typing import NDArray
-from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
@@ -30,6 +29,7 @@ from build_model.paper.bounds import Method
 from build_model.paper.reachability import possible_pixels
 from build_model.partition import partition
 from build_model.spatial_filter import spatial_filters
+from runtime import terminal
 from runtime.errors import fail
 from runtime.image import lit_columns
 from runtime.scene import Scene, SceneError
@@ -103,14 +103,14 @@ def main(
     whole_frame: Annotated[bool, typer.Option("--whole-frame", help="Bound NN_r at every pixel of the frame; slow.")] = False,
 ) -> None:
     """Compare spatial filters: sampled union, the build's S, mixed monotonicity, intervals, closed form."""
-    errors = Console(stderr=True)
+    errors = terminal.console(stderr=True)
     try:
         with Progress(console=errors, transient=True) as progress:
             counts = compare(Scene.load(scene_path), samples, seed, whole_frame=whole_frame, progress=progress)
     except (SceneError, ValueError) as error:
         fail(error)
-    Console().print(table_of(counts))
+    terminal.console().print(table_of(counts))
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    terminal.run(main)

@@ -26,7 +26,6 @@ Prints each figure and writes the scene file. Exit code 2 if no t of 0 to 2 px w
 from __future__ import annotations
 
 import functools
-import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -43,7 +42,7 @@ from simulate_approach import PAPER_SECONDS, WINDOW_US, Target, Vibration, event
 from build_model.calibration import displacement_px
 from build_model.export import build_banks
 from build_model.window import Window
-from runtime import Scene, SceneError
+from runtime import Scene, SceneError, terminal
 from runtime.errors import fail
 from runtime.frames import FrameStream
 from runtime.image import dilated, runway_image
@@ -183,7 +182,7 @@ def main(
     output: Annotated[Path, typer.Option("-o", "--output", help="Scene file to write.")] = Path("models/field.toml"),
 ) -> None:
     """Derive markings, tolerance and missed budget from simulated flights and write the scene file."""
-    console = Console(width=None if sys.stdout.isatty() else 130)
+    console = terminal.console(130)
     try:
         text = derive(Scene.load(scene), flights, seconds, share, console)
     except (SceneError, ValueError, OSError) as error:
@@ -195,4 +194,4 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    terminal.run(main)

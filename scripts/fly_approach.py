@@ -26,15 +26,16 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
+from rich.text import Text
 
 from build_model.spatial_filter import spatial_filters
-from runtime import Estimate, Estimator, ModelError, Scene
+from runtime import Estimate, Estimator, ModelError, Scene, terminal
 from runtime.errors import fail
 from runtime.frames import FrameStream
 from runtime.image import runway_image
 from runtime.recordings.draw import contact_sheet, draw_estimate, draw_runway, png
 from runtime.recordings.recording import RecordingError, read_events
-from runtime.scene import STATE_NAMES, STATE_UNITS
+from runtime.scene import STATE_COLUMNS, STATE_NAMES, STATE_UNITS
 from runtime.whole_file import write_whole
 
 WINDOW_US = 40_000
@@ -62,9 +63,9 @@ class Step:
         return self.estimate.box is not None and self.estimate.box.contains(self.truth)
 
     @property
-    def error(self) -> float:
-        """2-norm of estimate minus truth, rad and m together as in the paper; NaN where nothing is certified."""
-        return float("nan") if self.estimate.state is None else float(np.linalg.norm(self.estimate.state - self.truth))
+    def error(self) -> NDArray[np.float64]:
+        """Estimate minus truth, (4,), rad and m; NaN where nothing is certified."""
+        return np.full(4, np.nan) if self.estimate.state is None else self.estimate.state - self.truth
 
 
 def clutter_frames(clutter: str, shape: tuple[int, int], count: int, rng: np.random.Generator, console: Console) -> Frames:
@@ -116,7 +117,7 @@ def flight_table(scene: Scene, steps: Sequence[Step]) -> Table:
         numbers = ["-" if state is None else f"{state[axis]:.4f}" for state in states for axis in free_axes(scene)]
         answers = ["yes" if answer else "no" for answer in (estimate.used_fallback, estimate.touches_boundary)]
         counts = [str(estimate.cell), str(len(estimate.passing)), f"{step.milliseconds:.2f}"]
-        table.add_row(str(step.number), *numbers, "yes" if step.safe else "[bold red]NO", *answers, *counts)
+        table.add_row(str(step.number), *numbers, "yes" if step.safe else Text("NO", style="bold red"), *answers, *counts)
     return table
 
 
@@ -128,12 +129,13 @@ def summary_table(scene: Scene, steps: Sequence[Step], lit_shares: Sequence[floa
     table.add_row("certified", str(sum(estimate.certified for estimate in estimates)))
     table.add_row("violations (no box, or truth outside)", str(sum(not step.safe for step in steps)))
     if boxes := [estimate.box for estimate in estimates if estimate.box is not None]:
-        median, high = np.nanquantile([step.error for step in steps], (0.5, 0.95))
+        median, high = np.nanquantile(np.abs([step.error for step in steps]), (0.5, 0.95), axis=0)
         half_widths = np.median([box.half_widths for box in boxes], axis=0)
-        table.add_row("error, 2-norm of rad and m, median / 95 %", f"{median:.4f} / {high:.4f}")
+        free = [(axis, STATE_NAMES[axis], STATE_UNITS[axis]) for axis in free_axes(scene)]
         table.add_row(
-            "box half-width, median", ", ".join(f"{STATE_NAMES[a]} {half_widths[a]:.4f} {STATE_UNITS[a]}" for a in free_axes(scene))
+            "error, median / 95 %", ", ".join(f"{name} {median[axis]:.4f} / {high[axis]:.4f} {unit}" for axis, name, unit in free)
         )
+        table.add_row("box half-width, median", ", ".join(f"{name} {half_widths[axis]:.4f} {unit}" for axis, name, unit in free))
     table.add_row("box reaches a face of the domain", str(sum(estimate.touches_boundary for estimate in estimates)))
     table.add_row("fallback to the box's centre", str(sum(estimate.used_fallback for estimate in estimates)))
     table.add_row("cells passing, median", f"{np.median([len(e.passing) for e in estimates]):g} of {scene.domain.cell_count}")
@@ -145,18 +147,18 @@ def summary_table(scene: Scene, steps: Sequence[Step], lit_shares: Sequence[floa
 def csv_text(steps: Sequence[Step], lit_shares: Sequence[float]) -> str:
     """approach.csv: a line a frame, every state with its units; empty where nothing is certified."""
     kinds = ("truth", "estimate", "network", "lower", "upper")
-    states = [f"{kind}_{name}_{unit}" for kind in kinds for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True)]
+    states = [f"{kind}_{name}" for kind in kinds for name in STATE_COLUMNS]
     answers = ["outcome", "truth_inside", "fallback", "touches_boundary", "cell", "passing", "mismatch"]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["frame", *states, *answers, "error_2norm", "lit_share", "milliseconds"])
+    writer.writerow(["frame", *states, *answers, *(f"error_{name}" for name in STATE_COLUMNS), "lit_share", "milliseconds"])
     for step, lit_share in zip(steps, lit_shares, strict=True):
         e = step.estimate
         sides = (None, None) if e.box is None else (e.box.lower, e.box.upper)
         numbers = [[""] * 4 if state is None else state.tolist() for state in (step.truth, e.state, e.network_state, *sides)]
         outcome = [e.outcome.value, step.safe, e.used_fallback, e.touches_boundary, e.cell, len(e.passing), e.mismatch]
         writer.writerow(
-            [step.number, *itertools.chain(*numbers), *outcome, step.error if e.certified else "", lit_share, step.milliseconds]
+            [step.number, *itertools.chain(*numbers), *outcome, *(step.error if e.certified else [""] * 4), lit_share, step.milliseconds]
         )
     return text.getvalue()
 
@@ -199,9 +201,7 @@ def fly_approach(
     seed: Annotated[int, typer.Option(min=0, help="Seed of the clutter and of the pitch's phase.")] = 0,
 ) -> None:
     """Fly a simulated approach with a known truth and check every certificate."""
-    console = Console()
-    if not console.is_terminal:
-        console.width = NARROWEST_TABLE
+    console = terminal.console(NARROWEST_TABLE)
     try:
         kept = run(model or (BUILT_MODEL if BUILT_MODEL.is_file() else None), frames, clutter, out, seed, console)
     except (ModelError, RecordingError, OSError) as error:
@@ -211,4 +211,4 @@ def fly_approach(
 
 
 if __name__ == "__main__":
-    typer.run(fly_approach)
+    terminal.run(fly_approach)

@@ -37,7 +37,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 from onnx.checker import ValidationError
 
-from runtime import Estimator, FrameError, FrameStream, ModelError, SceneError
+from runtime import Estimator, FrameError, FrameStream, ModelError, SceneError, terminal
 from runtime.frames import EventError, events_to_frames
 from runtime.model.model_file import METADATA_KEY, metadata_digest
 from runtime.recordings.recording import RecordingError, read_events
@@ -453,7 +453,6 @@ class Worker:
 
 def fuzz(targets: list[str], minutes: float, seed: int, seeds: dict[str, bytes], output: Path) -> bool:
     """Runs cases of all targets in turn until the time is over. Returns True if there is no finding."""
-    from rich.console import Console
     from rich.progress import Progress
 
     counts: dict[str, collections.Counter[str]] = {target: collections.Counter() for target in targets}
@@ -474,7 +473,7 @@ def fuzz(targets: list[str], minutes: float, seed: int, seeds: dict[str, bytes],
             passed = time.monotonic() - start
             progress.update(bar, completed=passed, description=f"{number} rounds, {len(findings)} findings")
         worker.close()
-    console = Console()
+    console = terminal.console()
     for target, ended in counts.items():
         console.print(f"{target}: {ended.total()} cases, {', '.join(f'{count} {how}' for how, count in sorted(ended.items()))}")
     console.print(f"{len(findings)} findings{f', kept in {output}' if findings else ''}")

@@ -20,7 +20,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from runtime import Estimate, Estimator, ModelError
+from runtime import Estimate, Estimator, ModelError, terminal
 from runtime.errors import fail
 from runtime.frames import LARGEST_GAP_US, EventError, FrameStream
 from runtime.recordings.recording import RecordingError, read_events
@@ -123,4 +123,4 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    terminal.run(main)

@@ -16,7 +16,6 @@ import base64
 import html
 import itertools
 import json
-import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -33,7 +32,7 @@ from rich.progress import track
 
 from build_model.hough_bank import cell_bank
 from build_model.partition import partition
-from runtime import Estimate, Estimator, ModelError, Scene
+from runtime import Estimate, Estimator, ModelError, Scene, terminal
 from runtime.camera import project
 from runtime.errors import fail
 from runtime.image import runway_image
@@ -456,11 +455,15 @@ def run_rows(runs: Sequence[dict[str, Any]]) -> list[list[object]]:
         for key, text in (("windows", ""), ("inside", ", truth inside"), ("outside", ", truth outside"), ("no_runway", ", no runway")):
             rows.append([f"{name}{text}", *(run[kind][key] for run in runs)])
         for key, text in (("mean_error", "mean error"), ("largest_error", "largest error")):
-            rows.append([f"{name}, {text}", *("-" if run[kind][key] is None else f"{run[kind][key]:.4f}" for run in runs)])
-    half = [[run["mean_half_widths"][name] for name in ("theta_rad", "y_m", "z_m")] for run in runs]
-    rows.append(["half-widths of the box, means: θ rad, y m, z m", *(", ".join(f"{value:.4f}" for value in row) for row in half)])
+            rows.append([f"{name}, {text}: θ rad, y m, z m", *(_by_axis(run[kind][key]) for run in runs)])
+    rows.append(["half-widths of the box, means: θ rad, y m, z m", *(_by_axis(run["mean_half_widths"]) for run in runs)])
     rows.append(["ms a window, mean", *(f"{run['milliseconds_a_window']['mean']:.1f}" for run in runs)])
     return rows
+
+
+def _by_axis(values: dict[str, float] | None) -> str:
+    """Theta, y and z of a summary's numbers; a dash where it has none."""
+    return "-" if values is None else ", ".join(f"{values[name]:.4f}" for name in ("theta_rad", "y_m", "z_m"))
 
 
 def reproduce(model: Path | None, frames: int, runs: Sequence[Path], out: Path, seed: int, console: Console) -> bool:
@@ -506,7 +509,7 @@ def main(
     seed: Annotated[int, typer.Option(min=0, help="Seed of clutter and states.")] = 0,
 ) -> None:
     """Reproduce the paper's section IV as one page."""
-    console = Console(width=None if sys.stdout.isatty() else 130)
+    console = terminal.console(130)
     try:
         kept = reproduce(model, frames, run or [], out, seed, console)
     except (ModelError, ValueError, OSError) as error:
@@ -516,4 +519,4 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    terminal.run(main)

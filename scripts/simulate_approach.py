@@ -23,7 +23,6 @@ from __future__ import annotations
 import csv
 import io
 import math
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,11 +37,11 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from runtime import Scene, SceneError
+from runtime import Scene, SceneError, terminal
 from runtime.errors import fail
 from runtime.recordings.recording import EVENT
 from runtime.scene import STATE_NAMES, STATE_UNITS, Calibration
-from runtime.whole_file import replacing, write_whole
+from runtime.whole_file import OutputError, replacing, write_whole, writing
 
 WINDOW_US = 40_000
 STEP_US = 1_000
@@ -372,8 +371,11 @@ def write_raw(path: Path, events: NDArray[Any], shape: tuple[int, int]) -> None:
     packet = np.empty(len(events), dtype=faery.EVENTS_DTYPE)
     packet["t"], packet["x"], packet["y"], packet["on"] = events["t"], events["x"], events["y"], events["p"]
     stream = faery.events_stream_from_array(packet, dimensions=(shape[1], shape[0]))
-    with replacing(path) as part:
-        stream.to_file(part, version="evt3", zero_t0=False)
+    with writing(path), replacing(path) as part:
+        try:
+            stream.to_file(part, version="evt3", zero_t0=False)
+        except RuntimeError as error:  # faery's, of a disk that is full among others
+            raise OutputError(f"{path}: cannot be written ({error}); free some space there, or give another folder") from error
 
 
 def simulate(scene: Scene, start_s: float, seconds: float, seed: int, out: Path, console: Console) -> None:
@@ -410,12 +412,12 @@ def main(
     out: Annotated[Path, typer.Option(help="Folder for the recording and its truth.")] = Path("out/simulated"),
 ) -> None:
     """Simulate an event camera on an approach and write its recording with the truth."""
-    console = Console(width=None if sys.stdout.isatty() else 130)
+    console = terminal.console(130)
     try:
         simulate(Scene.load(scene), start, seconds, seed, out, console)
-    except (SceneError, ValueError, OSError) as error:
+    except (SceneError, ValueError, OutputError, OSError) as error:
         fail(error)
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    terminal.run(main)

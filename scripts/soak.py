@@ -16,8 +16,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.table import Table
+
+from runtime import terminal
 
 MB = 1e6
 STARTS = 5
@@ -91,7 +92,7 @@ def main(
     allowed_mb: Annotated[float, typer.Option(help="Growth that counts as none.")] = 2.0,
 ) -> None:
     """Print sizes and starts, run the loop, print the resident set."""
-    console = Console(width=120)
+    console = terminal.console()
     table = Table("embedded use", "", title_justify="left")
     on_disk = sizes(model)
     for name, size in on_disk.items():
@@ -119,4 +120,4 @@ def main(
 
 
 if __name__ == "__main__":
-    typer.run(main)
+    terminal.run(main)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
+import pickle
 from collections.abc import Callable, Iterator
 from dataclasses import fields
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ from numpy.typing import NDArray
 
 from runtime.batch import CHUNK
 from runtime.estimator import Box, Estimate, Estimator, FrameError
+from runtime.model.format import ModelError
 from runtime.recordings.bench import cluttered_frames
 
 
@@ -61,6 +65,40 @@ def test_an_endless_stream_is_taken_only_a_few_frames_ahead(estimator: Estimator
     first = list(itertools.islice(estimates, 3))
     assert same(first[2], estimator.estimate(frames[2], refine=False))
     assert len(taken) == 5 * CHUNK
+
+
+def test_a_change_of_folder_and_a_relative_path_do_no_harm(
+    model_of: Callable[[str], Path], frames: list[NDArray[np.uint8]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(model_of("one cell").parent)
+    loaded = Estimator.load(model_of("one cell").name)
+    monkeypatch.chdir(tmp_path)
+    assert [same(*pair) for pair in zip(loaded.estimate_many(frames[:2]), map(loaded.estimate, frames[:2]), strict=True)] == [True] * 2
+    assert same(copy.copy(loaded).estimate(frames[0]), loaded.estimate(frames[0]))
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, lambda estimator: pickle.loads(pickle.dumps(estimator))])
+def test_a_copy_of_an_estimator_is_one(
+    model_of: Callable[[str], Path], frames: list[NDArray[np.uint8]], copied: Callable[[Estimator], Estimator]
+) -> None:
+    original = Estimator.load(model_of("one cell"), missed_budget=2, extra_budget=500)
+    twin = copied(original)
+    assert (twin.missed_budget, twin.extra_budget, twin.sha256) == (2, 500, original.sha256)
+    assert same(twin.estimate(frames[0]), original.estimate(frames[0]))
+
+
+def test_a_pickle_asks_for_the_very_file(model_of: Callable[[str], Path], tmp_path: Path) -> None:
+    path = tmp_path / "model.onnx"
+    path.write_bytes(model_of("one cell").read_bytes())
+    pickled = pickle.dumps(Estimator.load(path))
+    path.write_bytes((Path(__file__).parents[1] / "models" / "paper.onnx").read_bytes())
+    with pytest.raises(ModelError, match="the caller trusts"):
+        pickle.loads(pickled)
+
+
+def test_a_frame_error_comes_back_from_another_process_as_it_was() -> None:
+    error = pickle.loads(pickle.dumps(FrameError("a list", "an array")))
+    assert (error.actual, error.expected, str(error)) == ("a list", "an array", "frame: found a list, expected an array")
 
 
 def test_a_frame_that_does_not_fit_is_an_error_when_its_turn_comes(estimator: Estimator, frames: list[NDArray[np.uint8]]) -> None:

@@ -94,6 +94,15 @@ def test_a_shift_of_a_whole_pixel_needs_the_next_one() -> None:
         check_calibration(replace(PAPER, calibration=Calibration(principal_px=1.0), tolerance=Tolerance(line_px=1)), WINDOW)
 
 
+def test_a_shift_beyond_the_largest_tolerance_says_how_much_smaller_the_plus_minus_must_be() -> None:
+    off = Calibration(roll_rad=0.035, yaw_rad=0.052)
+    with pytest.raises(SceneError, match=r"more than the largest line_px, 16; give at most 0\.\d\d of its plus-minus") as refused:
+        check_calibration(replace(PAPER, calibration=off), WINDOW)
+    share = float(str(refused.value).split("at most ")[1].split()[0])
+    less = Calibration(roll_rad=0.035 * share, yaw_rad=0.052 * share)
+    assert check_calibration(replace(PAPER, calibration=less, tolerance=Tolerance(line_px=16)), WINDOW) <= 16
+
+
 def test_a_yaw_that_turns_the_runway_behind_the_camera_is_refused() -> None:
     camera = replace(PAPER.camera, principal_point=(-4000.0, 240.0))
     with pytest.raises(SceneError, match=r"^calibration\.yaw_rad: 0\.4 can turn the runway behind"):

@@ -15,9 +15,10 @@ import cv2
 
 from runtime.camera import project
 from runtime.estimator import Box, Estimate, Outcome
+from runtime.explanation import Explanation, Reason, shortfall
 from runtime.image import runway_image
 from runtime.recordings import draw
-from runtime.scene import Camera, Scene
+from runtime.scene import Camera, Marking, Runway, Scene
 
 SCENE = Scene.load(Path(__file__).resolve().parents[1] / "models" / "paper.toml")
 TRUTH = np.array([0.63, 0.0, 0.93, 1.72])
@@ -48,6 +49,11 @@ def frame() -> NDArray:
 
 def with_colour(picture: NDArray, colour: tuple[int, int, int]) -> NDArray:
     return (picture == colour).all(axis=-1)
+
+
+def near_colour(picture: NDArray, colour: tuple[int, int, int]) -> NDArray:
+    """True where a line of that colour, smoothed, has most of it."""
+    return (np.abs(picture.astype(int) - colour) < 60).all(axis=-1)
 
 
 def test_every_pixel_has_the_colour_of_what_it_is():
@@ -130,7 +136,7 @@ def test_any_frame_and_outcome_can_be_drawn(box, truth, shape):
         assert picture.shape[1] >= 2 * max(draw.NARROWEST_PICTURE, shape[1])
         np.testing.assert_array_equal(given, before)
         colour = draw.NO_RUNWAY if box is None else draw.CERTIFIED
-        assert with_colour(picture[-5 * draw.LINE_HEIGHT :], colour).any()
+        assert near_colour(picture[-5 * draw.LINE_HEIGHT :], colour).any()
 
 
 def test_a_state_beyond_the_frame_gives_a_view_within_it():
@@ -138,6 +144,51 @@ def test_a_state_beyond_the_frame_gives_a_view_within_it():
     assert draw.runway_view(SCENE, estimate, None, 5, 1).top == 0
     view = draw.runway_view(SCENE, estimate, np.array([-0.6, 0, 0.8, 1.6]), 5, 1)
     assert (view.top, view.shape) == (480 - 96, (96, 128))
+
+
+def test_the_view_holds_all_markings_also_where_they_take_most_of_the_frame():
+    """A real runway: its near end fills the frame, its far end is a few pixels wide; the middle between them is empty."""
+    wide = replace(SCENE, runway=Runway((Marking("L", -0.9, 0.0, 0.6), Marking("R", 0.9, 0.0, 0.6))))
+    for scene in (SCENE, wide):
+        image = runway_image(scene, TRUTH)
+        estimate = replace(estimate_of(None, image), network_state=TRUTH)
+        for zoom in (1, 2, 5, 20):
+            view = draw.runway_view(scene, estimate, None, zoom, 3)
+            part = image[view.top : view.top + view.shape[0], view.left : view.left + view.shape[1]]
+            assert part.sum() == image.sum()
+            assert view.size[0] <= 480 // zoom * 3
+            assert view.size[1] <= 640 // zoom * 3
+            panel = draw.draw_runway(scene, image, estimate, zoom=zoom)
+            assert panel.shape == (480 // zoom * 3 + draw.LINE_HEIGHT, 640 // zoom * 3, 3)
+
+
+@pytest.mark.parametrize("width", [None, 640, 2000])
+def test_a_frame_without_a_certificate_shows_the_nearest_state_and_its_dark_pixels(width):
+    image = runway_image(SCENE, TRUTH)
+    frame, rows = image.copy(), np.argwhere(image)[::9]
+    frame[rows[:, 0], rows[:, 1]] = 0
+    estimate = replace(estimate_of(None, frame & 0), network_state=np.array([0.46, 0.0, 1.0, 1.6]))
+    told = Explanation(Reason.REFUTED, shortfall(SCENE, frame, TRUTH), 0)
+    plain = draw.draw_estimate(SCENE, frame, estimate, width=width)
+    picture = draw.draw_estimate(SCENE, frame, estimate, explanation=told, width=width)
+    assert picture.shape == plain.shape
+    right, text = picture[: picture.shape[0] * 3 // 4, picture.shape[1] // 2 :], picture[picture.shape[0] * 4 // 5 :]
+    assert near_colour(right, draw.NEAREST).any()
+    assert near_colour(right, draw.NO_RUNWAY).any()
+    assert near_colour(text, draw.NEAREST).any()
+    assert not near_colour(plain, draw.NEAREST).any()
+    assert told.nearest.missed == len(rows)
+    known = draw.draw_estimate(SCENE, frame, estimate, explanation=told, truth=TRUTH, width=width)
+    assert near_colour(known, draw.TRUTH).any()
+
+
+def test_a_smaller_picture_shows_the_same_light():
+    frame = np.zeros((480, 640), dtype=np.uint8)
+    frame[300:400, 40:240] = 1
+    picture = draw.draw_estimate(SCENE, frame, estimate_of(BOX, frame & 0), width=640)
+    left = picture[:240, :320]
+    assert with_colour(left, draw.FRAME)[151:199, 21:119].all()
+    assert with_colour(left, draw.BACKGROUND)[:10].all()
 
 
 def test_a_contact_sheet_places_its_pictures_row_by_row():

@@ -12,6 +12,7 @@ from email.parser import HeaderParser
 from pathlib import Path
 
 import pytest
+from lowest_versions import lowest_versions
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
@@ -23,6 +24,19 @@ TOP_LEVEL = {
 
 def requirement_names(requirements: list[str]) -> set[str]:
     return {re.split(r"[\[<>=!~; ]", requirement, maxsplit=1)[0] for requirement in requirements}
+
+
+# --- the user's own ---
+
+
+def test_an_estimator_leaves_nothing_in_the_users_home_and_prints_nothing(tmp_path: Path) -> None:
+    """onnxruntime would record its use there."""
+    program = "import numpy, runtime; e = runtime.Estimator.load(); e.estimate(numpy.zeros(e.scene.camera.shape, numpy.uint8))"
+    for home in (tmp_path, tmp_path / "missing" / "home"):
+        environment = {"HOME": str(home), "PYTHONPATH": str(ROOT)}
+        done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert list(tmp_path.iterdir()) == []
 
 
 # --- the repository ---
@@ -41,6 +55,26 @@ def test_constraints_pin_every_direct_dependency_to_a_public_release() -> None:
     wanted = set(PROJECT["dependencies"]).union(*(PROJECT["optional-dependencies"][extra] for extra in ("build", "recordings", "dev")))
     assert requirement_names(list(wanted)) - {PROJECT["name"]} <= {pin.partition("==")[0] for pin in pins}
     assert "torch==2.13.0" in pins
+
+
+def test_every_requirement_has_a_lowest_version_that_the_tested_one_is_not_below() -> None:
+    lowest = lowest_versions(ROOT / "pyproject.toml")
+    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    tested = dict(line.split("==") for line in lines if line and not line.startswith("#"))
+
+    def ordered(version: str) -> list[int]:
+        return [int(part) for part in re.findall(r"\d+", version)]
+
+    assert set(lowest) <= set(tested)
+    assert [name for name, version in lowest.items() if ordered(version) > ordered(tested[name])] == []
+    assert lowest["torch"] == tested["torch"]
+
+
+@pytest.mark.parametrize("requirement", ["numpy", "numpy<3", "numpy>=1.26,<3", "numpy==1.26"])
+def test_a_requirement_without_a_lower_bound_of_its_own_is_refused(tmp_path: Path, requirement: str) -> None:
+    (tmp_path / "p.toml").write_text(f'[project]\nname = "a"\ndependencies = ["{requirement}"]\noptional-dependencies = {{}}\n')
+    with pytest.raises(ValueError, match="give every requirement one lower bound"):
+        lowest_versions(tmp_path / "p.toml")
 
 
 # --- the wheel ---

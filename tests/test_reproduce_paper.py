@@ -47,12 +47,15 @@ def test_a_line_is_the_runways_if_both_ends_are_near_one_marking(paper_scene):
     assert paper.is_runway(found, paper_scene, truth).tolist() == [True, True, False, False]
 
 
+ERROR = {"theta_rad": 0.011, "x_m": 0.0, "y_m": 0.012, "z_m": 0.013}
+
+
 @pytest.fixture(scope="module")
 def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("page")
     run = folder / "run"
     run.mkdir()
-    verdict = {"windows": 3, "inside": 3, "outside": 0, "no_runway": 0, "mean_error": 0.01, "largest_error": 0.02}
+    verdict = {"windows": 3, "inside": 3, "outside": 0, "no_runway": 0, "mean_error": ERROR, "largest_error": ERROR}
     none = {"windows": 0, "inside": 0, "outside": 0, "no_runway": 0, "mean_error": None, "largest_error": None}
     summary = {"model": "a/field.onnx", "windows": 3, "certified": 3, "assumptions_hold": verdict, "assumptions_broken": none}
     summary |= {"mean_half_widths": dict.fromkeys(["theta_rad", "x_m", "y_m", "z_m"], 0.05), "milliseconds_a_window": {"mean": 9.0}}
@@ -88,6 +91,8 @@ def test_the_page_has_the_cells_the_frames_and_the_runs(page):
     assert tables[0].count("<tr>") == 28
     assert "<td>certified, truth inside the box</td><td>3</td>" in tables[1]
     assert "<td>assumptions hold, truth inside</td><td>3</td>" in tables[3]
+    assert "<td>assumptions hold, mean error: θ rad, y m, z m</td><td>0.0110, 0.0120, 0.0130</td>" in tables[3]
+    assert "<td>assumptions broken, mean error: θ rad, y m, z m</td><td>-</td>" in tables[3]
     assert "field assumes: An assumption of &lt;the run&gt;." in text
 
 

@@ -23,12 +23,15 @@ import typer
 from typer.testing import CliRunner, Result
 
 from runtime import Estimator
+from runtime.explanation import missed_pixels
 from runtime.frames import FrameStream
 from runtime.image import runway_image
 from runtime.recordings.cli import run_model
 from runtime.recordings.draw import MOST_MOMENTS, History, Moment, draw_history
 from runtime.recordings.recording import EVENT
-from runtime.recordings.report import COLUMNS, TRUTH_COLUMNS, Truth, TruthError, missed_pixels
+from runtime.recordings.report import COLUMNS, TRUTH_COLUMNS
+from runtime.recordings.truth import Truth, TruthError
+from runtime.recordings.video import is_whole
 
 MODEL = Path(__file__).parents[1] / "models" / "paper.onnx"
 RECORDINGS = Path(os.environ.get("GLIDEPROOF_RECORDINGS", Path(__file__).resolve().parents[2] / "shared" / "recordings"))
@@ -96,14 +99,17 @@ def test_a_recording_becomes_a_table_a_summary_pictures_and_a_video(recording, t
         assert row["outcome"] == "certified"
         assert (row["missed"], row["assumptions_hold"], row["truth_inside"]) == ("0", "1", "1")
         assert (np.less_equal(lower, state[[0, 2, 3]]) & np.less_equal(state[[0, 2, 3]], upper)).all()
-        assert float(row["error_2norm"]) < 0.15
+        found = [float(row[name]) for name in ("theta_rad", "x_m", "y_m", "z_m")]
+        assert [float(row[f"error_{name}"]) for name in ("theta_rad", "x_m", "y_m", "z_m")] == (np.array(found) - state).tolist()
+        assert np.linalg.norm(np.array(found) - state) < 0.15
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["assumptions_hold"]["windows"] == summary["assumptions_hold"]["inside"] == WINDOWS - 1
     assert summary["windows"] == WINDOWS == summary["certified"] + summary["no_runway"]
     assert summary["sha256"] == estimator.sha256
     assert summary["fault"] is None
     video = cv2.VideoCapture(str(tmp_path / "overlay.mp4"))
-    assert (video.get(cv2.CAP_PROP_FRAME_COUNT), video.get(cv2.CAP_PROP_FPS)) == (WINDOWS, 25)
+    assert (video.get(cv2.CAP_PROP_FRAME_COUNT), video.get(cv2.CAP_PROP_FPS)) == (-(-WINDOWS // 3), pytest.approx(25 / 3, rel=1e-4))
+    assert video.get(cv2.CAP_PROP_FRAME_WIDTH) == 640
     for name in [*(f"overlay_{number:06d}.png" for number in range(0, WINDOWS, 4)), "state.png"]:
         assert cv2.imread(str(tmp_path / name)).shape[1] == 1280
     assert not list(tmp_path.glob("*.part*"))
@@ -243,8 +249,146 @@ def test_after_ctrl_c_what_was_done_is_written(recording, tmp_path, monkeypatch)
     assert done.exit_code == 130
     assert "interrupted; 5 windows are written" in done.stderr
     assert len(rows_of(tmp_path)) == 5
-    assert cv2.VideoCapture(str(tmp_path / "overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 5
+    assert cv2.VideoCapture(str(tmp_path / "overlay.mp4")).get(cv2.CAP_PROP_FRAME_COUNT) == 2  # of five windows, the first and the fourth
     assert not list(tmp_path.glob("*.part*"))
+
+
+def without_pixels(events: NDArray, window: int, pixels: NDArray) -> NDArray:
+    """The events but for those of a window in the given pixels, (n, 2) row and column."""
+    dead = np.isin(events["y"] * 640 + events["x"], pixels @ [640, 1]) & (events["t"] // 40_000 == window)
+    return events[~dead]
+
+
+def test_windows_without_a_certificate_are_explained_by_numbers_that_help(events, estimator, tmp_path):
+    changed = events
+    for number in range(8, 12):
+        changed = without_pixels(changed, number, np.argwhere(runway_image(estimator.scene, STATES[number]))[5::15])
+    np.savez(tmp_path / "a.npz", t=changed["t"], x=changed["x"], y=changed["y"], p=changed["p"])
+    done = invoke(MODEL, tmp_path / "a.npz", "-o", tmp_path / "out", "--no-video")
+    assert done.exit_code == 0
+    rows = rows_of(tmp_path / "out")
+    lacking = [row for row in rows if row["outcome"] == "no runway"]
+    assert 4 <= len(lacking) <= 5
+    assert all((row["reason"] == "") == (row["outcome"] == "certified") for row in rows)
+    assert {row["reason"] for row in lacking} <= {"no entry passes NN_F", "found by NN_F, refuted by the refinement"}
+    assert all((row["passing"] == "0") == (row["reason"] == "no entry passes NN_F") for row in lacking)
+    assert all(0 < int(row["nearest_missed"]) <= int(row["nearest_pixels"]) and " row" in row["nearest_dark_rows"] for row in lacking)
+    told = json.loads((tmp_path / "out" / "summary.json").read_text())["no_runway_explained"]
+    assert sum(told["reasons"].values()) == len(lacking)
+    budget = told["certifying_budget"]
+    assert f"with --missed-budget {budget}" in done.stdout
+    assert invoke(MODEL, tmp_path / "a.npz", "-o", tmp_path / "more", "--no-video", "--missed-budget", budget).exit_code == 0
+    outcomes = {row["time_us"]: row["outcome"] for row in rows_of(tmp_path / "more")}
+    helped = [row for row in lacking if int(row["nearest_missed"]) <= budget]
+    assert 2 * len(helped) >= len(lacking)
+    assert {outcomes[row["time_us"]] for row in helped} == {"certified"}
+
+
+def test_a_truth_that_no_window_lies_within_is_told_with_both_ranges(recording, tmp_path):
+    rows = np.column_stack([10**12 + 40_000 * np.arange(WINDOWS), STATES])
+    np.savetxt(tmp_path / "t.csv", rows, delimiter=",", header="time_us,theta_rad,x_m,y_m,z_m", comments="", fmt=["%d", *["%.17g"] * 4])
+    done = invoke(MODEL, recording, "-o", tmp_path / "out", "--no-video", "--truth", tmp_path / "t.csv")
+    assert done.exit_code == 2
+    for part in ("t.csv: no window's middle lies within its times, 1000000.000000 to 1000000.960000 s", "0.020000 to 0.980000 s"):
+        assert part in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert len(rows_of(tmp_path / "out")) == WINDOWS
+
+
+@pytest.mark.parametrize(
+    ("options", "largest_bytes", "message"),
+    [
+        ([], 100_000, "overlay.mp4: the video was cut short, as by a full disk; free some space there, or use --no-video"),
+        (["--no-video"], 20_000, ".png: cannot be written (File too large)"),
+        (["--no-video"], 2_000, "estimates.csv: cannot be written (File too large)"),
+    ],
+)
+def test_a_full_disk_leaves_the_old_files_and_nothing_else(recording, tmp_path, options, largest_bytes, message):
+    """The system's limit on the size of a file stands for the disk."""
+    old = {"estimates.csv": "old table", "overlay.mp4": "old video", "overlay_000000.png": "old picture"}
+    old["summary.json"] = json.dumps({"files": [*old]})
+    for name, text in old.items():
+        (tmp_path / name).write_text(text)
+    limited = f"""
+import resource, signal
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, ({largest_bytes}, {largest_bytes}))
+from runtime.recordings.cli import run_model_command
+run_model_command()
+"""
+    command = [sys.executable, "-c", limited, MODEL, recording, "-o", tmp_path, *options]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    done = subprocess.run([str(part) for part in command], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 2
+    assert done.stderr.startswith(str(tmp_path))
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == old
+
+
+def test_only_an_earlier_reports_own_files_make_room_for_the_new_ones(recording, tmp_path):
+    assert invoke(MODEL, recording, "-o", tmp_path).exit_code == 0
+    for name in ("overlay_mine.png", "overlay_000001.png", "notes.txt"):
+        (tmp_path / name).write_text("foreign")
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert {*summary["files"]} | {"overlay_mine.png", "overlay_000001.png", "notes.txt"} == {path.name for path in tmp_path.iterdir()}
+    (tmp_path / "summary.json").write_text(json.dumps({"files": [*summary["files"], "notes.txt", "../outside.png", 5]}))
+    (tmp_path.parent / "outside.png").write_text("foreign")
+    assert invoke(MODEL, recording, "-o", tmp_path, "--no-video", "--window-ms", 500).exit_code == 0
+    own = {"estimates.csv", "summary.json", "state.png", "overlay_000000.png", "overlay_000001.png"}
+    assert own | {"overlay_mine.png", "notes.txt"} <= {path.name for path in tmp_path.iterdir()}
+    assert (tmp_path.parent / "outside.png").read_text() == "foreign"
+
+
+def test_a_recording_in_the_output_folder_is_not_replaced(events, tmp_path):
+    lines = [f"{t},{x},{y},{p}" for t, x, y, p in events[events["t"] < 40_000].tolist()]
+    (tmp_path / "estimates.csv").write_text("\n".join(lines))
+    done = invoke(MODEL, tmp_path / "estimates.csv", "-o", tmp_path)
+    assert done.exit_code == 2
+    assert "estimates.csv: is read and would be replaced; give another folder with -o" in done.stderr
+    assert {path.name: path.read_text() for path in tmp_path.iterdir()} == {"estimates.csv": "\n".join(lines)}
+
+
+@pytest.mark.parametrize("name", ["http:x", "pipe:1", "file:x", "concat:a|b", "10:30:00", "50%d", "run[/]x", "grüß", "a b'c"])
+def test_a_folder_may_have_any_name(events, tmp_path, monkeypatch, name):
+    """FFmpeg takes what stands before a colon for a protocol, and would look the host x up."""
+    part = events[events["t"] < 120_000]
+    np.savez(tmp_path / "a.npz", t=part["t"], x=part["x"], y=part["y"], p=part["p"])
+    monkeypatch.chdir(tmp_path)
+    done = invoke(MODEL, "a.npz", "-o", name)
+    assert (done.exit_code, done.stderr) == (0, "")
+    assert name in done.stdout
+    assert is_whole(tmp_path / name / "overlay.mp4")
+
+
+def test_a_recording_without_a_window_is_told(truth, tmp_path):
+    """Every event lies outside the sensor: there is neither a frame nor a video."""
+    np.savez(tmp_path / "a.npz", t=np.arange(9), x=np.full(9, 640), y=np.zeros(9, int), p=np.ones(9, int))
+    done = invoke(MODEL, tmp_path / "a.npz", "-o", tmp_path / "out")
+    assert done.exit_code == 0
+    assert "9 outside the sensor" in done.stderr
+    assert rows_of(tmp_path / "out") == []
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"estimates.csv", "summary.json", "state.png"}
+    assert invoke(MODEL, tmp_path / "a.npz", "-o", tmp_path / "out", "--truth", truth).exit_code == 2
+
+
+@pytest.mark.parametrize(("window_ms", "pictures", "rate"), [(0.25, 1, 10), (20, 2, 10), (3_600_000, 1, 0.1)])
+def test_a_video_is_in_the_recordings_time_whatever_the_windows_are(events, tmp_path, window_ms, pictures, rate):
+    part = events[events["t"] < window_ms * 10_000]
+    np.savez(tmp_path / "a.npz", t=part["t"], x=part["x"], y=part["y"], p=part["p"])
+    assert invoke(MODEL, tmp_path / "a.npz", "-o", tmp_path / "out", "--window-ms", window_ms, "--no-refine").exit_code == 0
+    video = cv2.VideoCapture(str(tmp_path / "out" / "overlay.mp4"))
+    assert video.get(cv2.CAP_PROP_FRAME_COUNT) == pictures
+    assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(rate, rel=1e-3)
+
+
+def test_a_cut_video_is_known_by_its_boxes(recording, tmp_path):
+    assert invoke(MODEL, recording, "-o", tmp_path).exit_code == 0
+    content = (tmp_path / "overlay.mp4").read_bytes()
+    assert is_whole(tmp_path / "overlay.mp4")
+    for size in (0, 7, 100, len(content) // 2, len(content) - 1):
+        (tmp_path / "cut.mp4").write_bytes(content[:size])
+        assert not is_whole(tmp_path / "cut.mp4")
 
 
 def test_without_opencv_one_line_says_what_to_install(recording):

@@ -20,10 +20,10 @@ from rich.console import Console
 from build_model.calibration import check_calibration
 from build_model.window import Window
 from runtime.camera import project
+from runtime.explanation import missed_pixels
 from runtime.frames import FrameStream
 from runtime.image import dilated, runway_image
 from runtime.recordings.recording import read_events
-from runtime.recordings.report import missed_pixels
 from runtime.scene import Calibration, Domain, Scene, Tolerance
 
 STEADY = simulator.Vibration(yaw_rad=0.0, roll_rad=0.0, pitch_rad=0.0)

@@ -17,10 +17,11 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
+import typer
 from flint import arb, ctx  # pyright: ignore[reportMissingModuleSource]
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
-from typer.testing import CliRunner
+from typer.testing import CliRunner, Result
 
 from build_model.assembly import assemble
 from build_model.export import build_banks, export_model
@@ -28,11 +29,11 @@ from build_model.filter_graph import filter_graph
 from build_model.filter_tables import FilterTables
 from build_model.hough_bank import CellBank, LineBoxes
 from build_model.pixel_mask import runs_of
+from build_model.verify import cli
 from build_model.verify.ball_camera import PRECISION_BITS, BallCamera, BallEntry, Ends, Slice, columns, columns_crossed
 from build_model.verify.box_claims import check_boxes
 from build_model.verify.cell_claim import cell_claims
 from build_model.verify.cell_proof import prove_cell
-from build_model.verify.cli import REFUTED, app
 from build_model.verify.counterexample import Counterexample, Refuted
 from build_model.verify.displacement import displacement_px
 from build_model.verify.model_graph import read_tables
@@ -785,8 +786,14 @@ def test_a_cells_claim_is_refuted_where_its_entry_is(model: Model) -> None:
     assert "do not cover" in found.claim
 
 
+def invoke(*arguments: object) -> Result:
+    app = typer.Typer()
+    app.command()(cli.verify_model)
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
 def test_command_prints_what_it_proved(files: dict[str, Path]) -> None:
-    result = CliRunner().invoke(app, [str(files["paper's shape"]), "--jobs", "1"])
+    result = invoke(files["paper's shape"], "--jobs", 1)
     assert result.exit_code == 0, result.output
     assert "proved" in result.output
     assert verify_model(files["paper's shape"]).sha256 in re.sub(r"[^0-9a-z]", "", result.output)
@@ -794,8 +801,8 @@ def test_command_prints_what_it_proved(files: dict[str, Path]) -> None:
 
 def test_command_exits_1_with_the_counterexample(model: Model, tmp_path: Path) -> None:
     drop_pixel_from_may_light(np.random.default_rng(0), model, 1)
-    result = CliRunner().invoke(app, [str(model.save(tmp_path / "mutated.onnx")), "--jobs", "1"])
-    assert result.exit_code == REFUTED
+    result = invoke(model.save(tmp_path / "mutated.onnx"), "--jobs", 1)
+    assert result.exit_code == cli.REFUTED
     line = result.stderr.strip()
     assert "\n" not in line
     for part in ("mutated.onnx: refuted: a state of the entry lights a pixel", "cell 1", "entry ", "row ", "column ", "theta "):
@@ -807,7 +814,7 @@ def test_command_exits_2_for_what_is_no_model(tmp_path: Path, content: bytes | N
     path = tmp_path / "model.onnx"
     if content is not None:
         path.write_bytes(content)
-    result = CliRunner().invoke(app, [str(path)])
+    result = invoke(path)
     assert result.exit_code == 2
     assert str(path) in result.stderr
     assert len(result.stderr.strip().splitlines()) == 1

@@ -32,6 +32,7 @@ SHARED_WITH_VERIFIER = {
     "runtime.model.onnx_subset",
     "runtime.model.protobuf",
     "runtime.scene",
+    "runtime.terminal",  # what the command prints on
 }
 """All that the proof may load of the project beside its own: no mask, bound or rounding of the build, no state network, no refinement."""
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
+from runtime import terminal
 from runtime.errors import fail
 from runtime.model.format import ModelError
 
 try:
     import typer
-    from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
     from rich.table import Table
 
@@ -19,16 +19,14 @@ except ImportError as error:
     fail(f"verify-model: the package {error.name!r} is missing; pip install 'glideproof[build]'")
 
 REFUTED = 1
-app = typer.Typer(add_completion=False)
 
 
-@app.command()
 def verify_model(
     model: Annotated[Path, typer.Argument(help="Model file that export-model wrote.")],
     jobs: Annotated[int, typer.Option(min=1, help="Processes that prove cells.")] = 2,
 ) -> None:
     """Prove a model's certificate anew, from its own tensors and the scene in its metadata. Exit code 1: a counterexample; 2: unusable."""
-    console = Console()
+    console = terminal.console()
     columns = TextColumn("cells"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
     try:
         with Progress(*columns, console=console) as bar:
@@ -64,4 +62,4 @@ def _table(model: Path, report: proof.VerificationReport) -> Table:
 
 def verify_model_command() -> None:
     """Entry point of `verify-model`."""
-    app()
+    terminal.run(verify_model)

@@ -7,19 +7,22 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from numpy.typing import NDArray
 
+from runtime import terminal
 from runtime.errors import INTERRUPTED, complain, fail
 from runtime.estimator import Estimator
 from runtime.frames import LARGEST_GAP_US, EventError, FrameStream
 from runtime.model.format import ModelError
-from runtime.whole_file import write_whole
+from runtime.whole_file import OutputError, OutputFolder
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 try:
     import typer
-    from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
     from rich.table import Table
 
@@ -38,7 +41,8 @@ try:
     from runtime.recordings.draw import png
     from runtime.recordings.noted import lines_of, noted_of
     from runtime.recordings.recording import Notes, RecordingError, read_events
-    from runtime.recordings.report import Report, Truth, TruthError
+    from runtime.recordings.report import Report
+    from runtime.recordings.truth import Truth, TruthError
 except ImportError as missing:
     fail(f"{Path(sys.argv[0]).name}: the package {missing.name!r} is missing; pip install 'glideproof[recordings]'")
 
@@ -60,10 +64,10 @@ def run_model(
 ) -> None:
     """Take a recording to states and certified boxes: estimates.csv, summary.json, pictures and a video.
 
-    Exit code 0; 1 if the recording is damaged or ends early (what was good before is written); 2 if something given cannot be used;
-    130 after Ctrl-C (what was done is written).
+    Exit code 0; 1 if the recording is damaged or ends early (what was good before is written); 2 if something given cannot be used, as
+    a truth within whose times no window lies (the estimates are written); 130 after Ctrl-C (what was done is written).
     """
-    console = Console(width=None if sys.stdout.isatty() else 120)
+    console = terminal.console()
     try:
         estimator = Estimator.load(model, missed_budget=missed_budget)
         step_us = None if step_ms is None else _microseconds(step_ms)
@@ -72,29 +76,49 @@ def run_model(
         known = None if truth is None else Truth.load(truth)
         packets = _nonempty(recording, read_events(recording, estimator.scene.camera.shape, notes))
         folder = output or Path("out") / recording.stem
-        report = Report(folder, estimator, stream.window_us, stream.step_us, known, video=video, missed_budget=missed_budget)
-    except (ModelError, EventError, RecordingError, TruthError, OSError) as error:
+        inputs = [path for path in (model, recording, truth) if path is not None]
+        with Report(folder, estimator, stream.window_us, stream.step_us, known, video=video, inputs=inputs) as report:
+            fault, code = _estimated(console, stream, packets, report, refine)
+            noted = noted_of(stream, notes)
+            source = {"model": str(model), "sha256": estimator.sha256, "recording": str(recording), "fault": fault}
+            summary = report.close({**source, "window_us": stream.window_us, "step_us": stream.step_us, **noted})
+    except (ModelError, EventError, RecordingError, TruthError, OutputError) as error:
         fail(error)
-    fault, code = None, 0
-    try:
-        with _progress(console) as bar:
-            _estimate_all(stream, packets, report, refine, bar)
-    except (RecordingError, EventError) as error:
-        # What came before the fault is whole: its last windows are estimated as well.
-        _estimate_all(stream, iter(()), report, refine, None)
-        fault, code = str(error), DAMAGED
-    except KeyboardInterrupt:
-        fault, code = "interrupted", INTERRUPTED
     except OSError as error:
-        fail(f"{folder}: cannot be written ({error})")
-    noted = noted_of(stream, notes)
-    source = {"model": str(model), "sha256": estimator.sha256, "recording": str(recording), "fault": fault}
-    summary = report.close({**source, "window_us": stream.window_us, "step_us": stream.step_us, **noted})
+        fail(f"{recording}: cannot be read ({error.strerror or error}); give the path of a recording that can")
     _print_summary(console, folder, summary)
     for line in lines_of(noted):
         complain(f"{recording}: {line}")
     if fault:
         fail(f"{fault}; {summary['windows']} windows are written to {folder}", code)
+    if truth is not None and known is not None and "assumptions_hold" not in summary:
+        fail(_unmatched(truth, known, summary))
+
+
+def _estimated(
+    console: Console, stream: FrameStream, packets: Iterator[NDArray[Any]], report: Report, refine: bool
+) -> tuple[str | None, int]:
+    """Every window into the report; what ended them early, if something did, and the exit code for it."""
+    try:
+        with _progress(console) as bar:
+            _estimate_all(stream, packets, report, refine, bar)
+    except KeyboardInterrupt:
+        return "interrupted", INTERRUPTED
+    except (RecordingError, EventError, OSError) as error:
+        # What came before the fault is whole: its last windows are estimated as well.
+        _estimate_all(stream, iter(()), report, refine, None)
+        return str(error), DAMAGED
+    return None, 0
+
+
+def _unmatched(path: Path, truth: Truth, summary: dict[str, Any]) -> str:
+    """What to say of a truth that judges no window."""
+    known, seen = _seconds((truth.time_us[0], truth.time_us[-1])), _seconds(summary["window_middles_us"])
+    return f"{path}: no window's middle lies within its times, {known}; they run from {seen}; give time_us on the recording's own clock"
+
+
+def _seconds(range_us: tuple[float, float] | None) -> str:
+    return "none to none" if range_us is None else f"{range_us[0] / 1e6:.6f} to {range_us[1] / 1e6:.6f} s"
 
 
 def _microseconds(milliseconds: float) -> int:
@@ -111,7 +135,7 @@ def _nonempty(recording: Path, packets: Iterator[NDArray[Any]]) -> Iterator[NDAr
 
 def _progress(console: Console) -> Progress:
     texts = TextColumn("windows {task.completed}"), TextColumn("{task.fields[seconds]:.2f} s of recording")
-    return Progress(texts[0], BarColumn(), texts[1], TimeElapsedColumn(), console=console, transient=True)
+    return Progress(texts[0], BarColumn(), texts[1], TimeElapsedColumn(), console=console, transient=True, disable=not console.is_terminal)
 
 
 def _estimate_all(stream: FrameStream, packets: Iterator[NDArray[Any]], report: Report, refine: bool, bar: Progress | None) -> None:
@@ -129,12 +153,15 @@ def _estimate_all(stream: FrameStream, packets: Iterator[NDArray[Any]], report: 
 
 def _print_summary(console: Console, folder: Path, summary: dict[str, Any]) -> None:
     table = Table(title=str(folder), title_justify="left", show_header=False)
+    table.add_column(no_wrap=True)
+    table.add_column(overflow="fold")
     half_widths = ", ".join(f"{name} {value:.4f}" for name, value in summary["mean_half_widths"].items())
     rows = {
         "recording read as": summary["layout"],
         "windows": summary["windows"],
         "certified": summary["certified"],
         "no runway": summary["no_runway"],
+        **_explained(summary.get("no_runway_explained")),
         "fallback to the box's centre": summary["fallback"],
         "box reaches the domain's face": summary["touches_boundary"],
         "half-widths, mean": half_widths if summary["certified"] else "-",
@@ -142,24 +169,44 @@ def _print_summary(console: Console, folder: Path, summary: dict[str, Any]) -> N
     }
     for kind, name in (("assumptions_hold", "assumptions hold"), ("assumptions_broken", "assumptions broken")):
         if kind in summary:
-            rows[name] = _judged(summary[kind])
+            rows |= _judged(name, summary[kind])
     for name, value in rows.items():
         table.add_row(name, str(value))
     console.print(table)
     console.print("The certificate assumes:")
     for line in summary["assumptions"]:
-        console.print(f"  - {line}", highlight=False, markup=False)
+        console.print(f"  - {line}", highlight=False)
 
 
-def _judged(counts: dict[str, Any]) -> str:
-    text = "{windows} windows: {inside} with the truth inside, {outside} outside, {no_runway} no runway".format(**counts)
-    mean, largest = counts["mean_error"], counts["largest_error"]
-    return text if mean is None else f"{text}; error {mean:.4f} mean, {largest:.4f} largest"
+def _explained(lacking: dict[str, Any] | None) -> dict[str, str]:
+    """Rows on the windows without a certificate: why, how far off their nearest states are, where, and which number to change."""
+    if lacking is None:
+        return {}
+    reasons = "; ".join(f"{count} {reason}" for reason, count in lacking["reasons"].items())
+    missed = "{least} to {most} pixels dark, {median} in the median".format(**lacking["nearest_state_missed"])
+    rows = {"  why": reasons, "  nearest states, not certified": f"{missed}; {lacking['missed_budget']} may be"}
+    darkest = [f"{name} row {max(counts, key=counts.get)}" for name, counts in lacking["windows_by_dark_row"].items()]
+    if darkest:
+        rows["  dark most often"] = ", ".join(darkest)
+    if (budget := lacking["certifying_budget"]) is not None:
+        rows["  at least half would be certified"] = f"with --missed-budget {budget}"
+    elif lacking["nearest_state_missed"]["median"] > lacking["largest_budget"]:
+        rows["  half of them lack more than"] = f"any --missed-budget that this model takes, {lacking['largest_budget']}"
+    return rows
+
+
+def _judged(name: str, counts: dict[str, Any]) -> dict[str, str]:
+    """Rows on the windows with a truth."""
+    rows = {name: "{windows} windows: {inside} with the truth inside, {outside} outside, {no_runway} no runway".format(**counts)}
+    if counts["mean_error"] is not None:
+        sizes = zip(counts["mean_error"].items(), counts["largest_error"].values(), strict=True)
+        rows[f"{name}: error, mean / largest"] = ", ".join(f"{column} {mean:.4f} / {largest:.4f}" for (column, mean), largest in sizes)
+    return rows
 
 
 def run_model_command() -> None:
     """Entry point of `run-model`."""
-    typer.run(run_model)
+    terminal.run(run_model)
 
 
 def bench_model(
@@ -172,7 +219,7 @@ def bench_model(
     seed: Annotated[int, typer.Option(help="Seed of the frames.")] = 0,
 ) -> None:
     """Time the model beside OpenCV's line detectors, on one thread, on the same frames: table, bench.csv and bench.png."""
-    console = Console(width=None if sys.stdout.isatty() else 120)
+    console = terminal.console()
     rows: list[Latency] = []
     try:
         estimator = Estimator.load(model)
@@ -185,9 +232,11 @@ def bench_model(
         for refine in (False, True):
             seen = cluttered_frames(estimator.scene, THROUGHPUT_CLUTTER, frames, seed)
             console.print(_rates(refine, *throughput(estimator, seen, frames * rounds, refine)), highlight=False)
-        write_whole(output / "bench.csv", as_csv(header, rows).encode())
-        write_whole(output / "bench.png", png(chart(header, rows)))
-    except (ModelError, EventError, RecordingError, OSError) as error:
+        files = OutputFolder(output)
+        files.write("bench.csv", as_csv(header, rows).encode())
+        files.write("bench.png", png(chart(header, rows)))
+        files.replace()
+    except (ModelError, EventError, RecordingError, OutputError, OSError) as error:
         fail(error)
 
 
@@ -207,4 +256,4 @@ def _latency_table(rows: Sequence[Latency]) -> Table:
 
 def bench_model_command() -> None:
     """Entry point of `bench-model`."""
-    typer.run(bench_model)
+    terminal.run(bench_model)

@@ -7,6 +7,8 @@
 | green | filtered pixels: the frame within the masks of the passing cells |
 | amber, translucent | the certified box, projected into the image |
 | magenta line | the markings of the estimated state |
+| cyan line | where nothing is certified: the markings of the nearest state, of which nothing is certified |
+| red pixels | dark ones of the true state's runway, or of the nearest state's where the truth is not known |
 | white line and circles | the markings of the true state and their ends, where it is known |
 
 `draw_history` shows states against time in the same colours.
@@ -19,6 +21,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -26,6 +29,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from runtime.camera import project
 from runtime.estimate import Box, Estimate
+from runtime.explanation import Explanation, dark_pixels
+from runtime.image import image_of_ends
 from runtime.scene import STATE_NAMES, STATE_UNITS, Scene
 
 Picture = NDArray[np.uint8]
@@ -33,7 +38,9 @@ Colour = tuple[int, int, int]
 
 BACKGROUND, TEXT, FRAME, FRAME_BORDER = (24, 22, 20), (225, 225, 225), (150, 150, 150), (90, 90, 90)
 MASK, MASK_TEXT, FILTERED, BOX, STATE, TRUTH = (140, 60, 20), (230, 140, 70), (90, 215, 70), (0, 170, 255), (255, 60, 255), (255, 255, 255)
-CERTIFIED, NO_RUNWAY = (90, 215, 70), (80, 80, 255)
+CERTIFIED, NO_RUNWAY, NEAREST = (90, 215, 70), (80, 80, 255), (255, 230, 90)
+PIXELS = np.array([BACKGROUND, MASK, FRAME, FILTERED, NO_RUNWAY], dtype=np.uint8)
+"""Colours of pixels: dark, dark in S, lit, lit and filtered, dark in the runway."""
 BAND = (0, 85, 130)
 """Amber as it looks over the background."""
 BOX_LIGHT = 0.16
@@ -50,6 +57,10 @@ HISTORY_WIDTH, PANEL_HEIGHT, PANEL_LEFT, PANEL_GAP = 1280, 200, 150, 14
 NARROWEST_PICTURE = 560
 """Width that the text needs, px; narrower frames are magnified."""
 LINE_HEIGHT = 24
+TEXT_LINES, LONGEST_TEXT = 5, 110
+"""Lines below a picture, and characters of one that says why nothing is certified."""
+ROOM = 1.25
+"""Sides of the part of the frame that is shown close up, over those of the markings' image."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +70,12 @@ class View:
     top: int
     left: int
     shape: tuple[int, int]
-    scale: int
+    scale: float
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(height, width) of its picture."""
+        return int(self.shape[0] * self.scale), int(self.shape[1] * self.scale)
 
     def points(self, uv: ArrayLike) -> NDArray[np.int32]:
         """Frame coordinates (..., 2) px as the picture's fixed-point coordinates for OpenCV's `shift`."""
@@ -75,26 +91,29 @@ def draw_estimate(
     *,
     mask: NDArray[np.bool_] | None = None,
     truth: ArrayLike | None = None,
+    explanation: Explanation | None = None,
     title: str = "",
     zoom: int = 5,
+    width: int | None = None,
 ) -> Picture:
-    """The whole frame, beside it the runway `zoom` times larger, and below them the outcome in numbers with a legend.
+    """The whole frame, beside it the runway at most `zoom` times larger, and below them the outcome in numbers with a legend.
 
-    `frame`: (height, width), lit where not 0. `mask`: S of `estimate.cell`, bool (height, width). `truth`: a state (4,).
-    Returns (height', 2 width', 3), where width' is the frame's width, magnified until the text fits.
+    `frame`: (height, width), lit where not 0. `mask`: S of `estimate.cell`, bool (height, width). `truth`: a state (4,). `explanation`:
+    of an estimate without a box. Returns (height', `width`, 3); by default twice the frame's width, magnified until the text fits.
     """
-    scale = -(-NARROWEST_PICTURE // frame.shape[1])
+    scale = -(-NARROWEST_PICTURE // frame.shape[1]) if width is None else width / 2 / frame.shape[1]
     whole = View(0, 0, frame.shape, scale)
-    close = runway_view(scene, estimate, truth, zoom, scale * zoom)
-    pixels = colour_pixels(frame, estimate.filtered, mask)
-    panels = [_magnified(pixels, whole), _magnified(pixels, close)]
+    close = runway_view(scene, estimate, truth, zoom, scale * zoom, explanation)
+    dark = _dark(scene, frame, truth, explanation)
+    panels = [_magnified(_pixels(frame, estimate.filtered, mask, dark), view) for view in (whole, close)]
     _outline(panels[0], whole, close)
-    _draw_states(panels[1], scene, close, estimate, truth)
-    beside = np.full((panels[0].shape[0], 2 * panels[0].shape[1], 3), BACKGROUND, dtype=np.uint8)
-    for panel, left in zip(panels, (0, panels[0].shape[1]), strict=True):
+    _draw_states(panels[1], scene, close, estimate, truth, explanation)
+    height, half = whole.size
+    beside = _canvas(height, 2 * half)
+    for panel, left in zip(panels, (0, half), strict=True):
         beside[: panel.shape[0], left : left + panel.shape[1]] = panel
-    beside[:, panels[0].shape[1]] = FRAME_BORDER
-    return np.concatenate([beside, _text_strip(scene, estimate, truth, title, mask is not None, beside.shape[1])])
+    beside[:, half] = FRAME_BORDER
+    return np.concatenate([beside, _text_strip(scene, estimate, truth, explanation, title, mask is not None, beside.shape[1])])
 
 
 def draw_runway(
@@ -108,13 +127,15 @@ def draw_runway(
     zoom: int = 5,
     scale: int = 3,
 ) -> Picture:
-    """Only the runway's surroundings, 1/`zoom` of the frame a side, magnified `scale` times, with one line of text."""
+    """Only the runway's surroundings, as large as 1/`zoom` of the frame a side magnified `scale` times, with one line of text."""
     view = runway_view(scene, estimate, truth, zoom, scale)
-    panel = _magnified(colour_pixels(frame, estimate.filtered, mask), view)
-    _draw_states(panel, scene, view, estimate, truth)
-    strip = np.full((LINE_HEIGHT, panel.shape[1], 3), BACKGROUND, dtype=np.uint8)
-    _write(strip, 0, [(title, TEXT), _outcome(estimate), (_cells(scene, estimate), TEXT)])
-    return np.concatenate([strip, panel])
+    panel = _magnified(_pixels(frame, estimate.filtered, mask, None), view)
+    _draw_states(panel, scene, view, estimate, truth, None)
+    height, width = (max(side // zoom, 1) * scale for side in frame.shape)
+    picture = _canvas(LINE_HEIGHT + height, width)
+    picture[LINE_HEIGHT : LINE_HEIGHT + panel.shape[0], : panel.shape[1]] = panel
+    _write(picture, 0, [(title, TEXT), _outcome(estimate), (_cells(scene, estimate), TEXT)])
+    return picture
 
 
 @dataclass(frozen=True)
@@ -170,7 +191,7 @@ def draw_history(scene: Scene, history: History, width: int = HISTORY_WIDTH) -> 
     """
     free = [axis for axis in range(4) if scene.domain.upper[axis] > scene.domain.lower[axis]]
     moments = history.moments or [Moment(0, 1, None, None, None, None)]
-    picture = np.full((len(free) * (PANEL_HEIGHT + PANEL_GAP) + 2 * LINE_HEIGHT, width, 3), BACKGROUND, dtype=np.uint8)
+    picture = _canvas(len(free) * (PANEL_HEIGHT + PANEL_GAP) + 2 * LINE_HEIGHT, width)
     seconds = moments[0].start_us / 1e6, moments[-1].stop_us / 1e6
     _write(picture, 0, [("certified band", BOX), ("estimate", STATE), ("truth", TRUTH), ("no runway", NO_RUNWAY)])
     for place, axis in enumerate(free):
@@ -207,6 +228,11 @@ def _draw_panel(panel: Picture, moments: Sequence[Moment], axis: int, low: float
             cv2.polylines(panel, [np.array(known, dtype=np.int32)], False, colour, 1, cv2.LINE_AA)
 
 
+def png(picture: Picture) -> bytes:
+    """The picture as a PNG file."""
+    return cv2.imencode(".png", picture)[1].tobytes()
+
+
 def contact_sheet(pictures: Sequence[Picture], columns: int = 4, gap: int = 8) -> Picture:
     """Pictures of one shape, row by row, at most `columns` beside each other, `gap` px apart."""
     columns = min(columns, len(pictures))
@@ -220,13 +246,34 @@ def contact_sheet(pictures: Sequence[Picture], columns: int = 4, gap: int = 8) -
     return sheet
 
 
-def runway_view(scene: Scene, estimate: Estimate, truth: ArrayLike | None, zoom: int, scale: int) -> View:
-    """1/`zoom` of the frame a side, within it, around the markings of estimate and truth, or of NN_e's state if there is neither."""
-    known = [np.asarray(state) for state in (estimate.state, truth) if state is not None] or [estimate.network_state]
-    centre = project(scene, np.stack(known)).reshape(-1, 2).mean(axis=0)
-    size = np.maximum(np.array(scene.camera.shape) // zoom, 1)
-    start = np.clip(np.round(np.nan_to_num(centre[::-1]) - size / 2), 0, np.array(scene.camera.shape) - size).astype(int)
-    return View(int(start[0]), int(start[1]), (int(size[0]), int(size[1])), scale)
+def runway_view(
+    scene: Scene, estimate: Estimate, truth: ArrayLike | None, zoom: int, scale: float, explanation: Explanation | None = None
+) -> View:
+    """The part of the frame, within it, around all markings of estimate and truth; else of the nearest state, else of NN_e's.
+
+    1/`zoom` of the frame a side, magnified `scale` times; where the markings need more room, a larger part that is magnified less.
+    """
+    nearest = None if explanation is None else explanation.nearest.state
+    known = [np.asarray(state) for state in (estimate.state, truth) if state is not None]
+    known = known or [estimate.network_state if nearest is None else nearest]
+    frame = np.array(scene.camera.shape)
+    low, high = _extent(scene, np.stack(known))
+    part = next((part for part in range(zoom, 1, -1) if (frame // part >= ROOM * (high - low)).all()), 1)
+    size = np.maximum(frame // part, 1)
+    start = np.clip(np.round((low + high) / 2 - size / 2), 0, frame - size).astype(int)
+    fitting = scale if part == zoom else scale * (np.maximum(frame // zoom, 1) / size).min()
+    return View(int(start[0]), int(start[1]), (int(size[0]), int(size[1])), fitting)
+
+
+def _extent(scene: Scene, states: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """First and last (row, column) of the frame that the states' runways light; where they light none, the place nearest to them."""
+    ends = project(scene, states[np.isfinite(states).all(axis=1)])
+    lit = np.argwhere(image_of_ends(ends, scene.camera.shape).any(axis=0))
+    if len(lit) == 0:
+        centre = ends.mean(axis=(0, 1, 2))[::-1] if len(ends) else np.zeros(2)
+        nearest = np.clip(centre, 0, scene.camera.shape)
+        return nearest, nearest
+    return lit.min(axis=0), lit.max(axis=0) + 1.0
 
 
 def box_outlines(scene: Scene, box: Box) -> NDArray[np.float64]:
@@ -242,17 +289,44 @@ def box_outlines(scene: Scene, box: Box) -> NDArray[np.float64]:
 
 def colour_pixels(frame: NDArray, filtered: NDArray, mask: NDArray[np.bool_] | None) -> Picture:
     """Background, S, frame and filtered pixels, each over the ones before: (height, width, 3)."""
-    pixels = np.full((*frame.shape, 3), BACKGROUND, dtype=np.uint8)
-    if mask is not None:
-        pixels[mask] = MASK
-    pixels[frame != 0] = FRAME
-    pixels[filtered != 0] = FILTERED
-    return pixels
+    return _coloured(_pixels(frame, filtered, mask, None))
 
 
-def _magnified(pixels: Picture, view: View) -> Picture:
-    part = pixels[view.top : view.top + view.shape[0], view.left : view.left + view.shape[1]]
-    return part.repeat(view.scale, axis=0).repeat(view.scale, axis=1)
+def _pixels(frame: NDArray, filtered: NDArray, mask: NDArray[np.bool_] | None, dark: NDArray[np.bool_] | None) -> NDArray[np.uint8]:
+    """Each pixel's place in `PIXELS`, (height, width)."""
+    places = np.zeros(frame.shape, dtype=np.uint8)
+    for place, lit in enumerate((mask, frame, filtered, dark), start=1):
+        if lit is not None:
+            places[lit != 0] = place
+    return places
+
+
+def _dark(scene: Scene, frame: NDArray, truth: ArrayLike | None, explanation: Explanation | None) -> NDArray[np.bool_] | None:
+    """The runway's dark pixels, (height, width): the true one's, or the nearest state's."""
+    if truth is None and explanation is None:
+        return None
+    state = truth if explanation is None or truth is not None else explanation.nearest.state
+    return np.any(dark_pixels(scene, frame, np.asarray(state)), axis=0)
+
+
+def _coloured(places: NDArray[Any]) -> Picture:
+    table = np.zeros((256, 1, 3), dtype=np.uint8)
+    table[: len(PIXELS), 0] = PIXELS
+    return np.asarray(cv2.applyColorMap(places, table), dtype=np.uint8)
+
+
+def _canvas(height: int, width: int) -> Picture:
+    """An empty picture."""
+    row = np.full((width, 3), BACKGROUND, dtype=np.uint8)
+    return np.broadcast_to(row, (height, width, 3)).copy()  # a row at a time, which is much faster than pixel by pixel
+
+
+def _magnified(places: NDArray[np.uint8], view: View) -> Picture:
+    """The view's part of the pixels; pixels stay squares where they are larger than the picture's, and are averaged where smaller."""
+    part = np.ascontiguousarray(places[view.top : view.top + view.shape[0], view.left : view.left + view.shape[1]])
+    if view.scale >= 1:
+        return _coloured(cv2.resize(part, view.size[::-1], interpolation=cv2.INTER_NEAREST))
+    return np.asarray(cv2.resize(_coloured(part), view.size[::-1], interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def _outline(panel: Picture, whole: View, part: View) -> None:
@@ -262,8 +336,10 @@ def _outline(panel: Picture, whole: View, part: View) -> None:
     cv2.rectangle(panel, (left, top), (right, bottom), FRAME_BORDER, 1)
 
 
-def _draw_states(panel: Picture, scene: Scene, view: View, estimate: Estimate, truth: ArrayLike | None) -> None:
-    """The box as a translucent band, then the markings of the estimate and of the truth."""
+def _draw_states(
+    panel: Picture, scene: Scene, view: View, estimate: Estimate, truth: ArrayLike | None, explanation: Explanation | None
+) -> None:
+    """The box as a translucent band, then the markings of the nearest state, of the truth and of the estimate."""
     if estimate.box is not None:
         hulls = [cv2.convexHull(view.points(points)) for points in box_outlines(scene, estimate.box)]
         filled = np.zeros_like(panel)
@@ -274,23 +350,38 @@ def _draw_states(panel: Picture, scene: Scene, view: View, estimate: Estimate, t
     if truth is not None:
         for u, v in view.points(project(scene, truth)).reshape(-1, 2).tolist():
             cv2.circle(panel, (u, v), END_RADIUS << FRACTION_BITS, TRUTH, 1, cv2.LINE_AA, FRACTION_BITS)
-    for state, colour in ((truth, TRUTH), (estimate.state, STATE)):
+    nearest = None if explanation is None else explanation.nearest.state
+    for state, colour in ((nearest, NEAREST), (truth, TRUTH), (estimate.state, STATE)):
         if state is not None:
             cv2.polylines(panel, list(view.points(project(scene, state))), False, colour, 1, cv2.LINE_AA, FRACTION_BITS)
 
 
-def _text_strip(scene: Scene, estimate: Estimate, truth: ArrayLike | None, title: str, has_mask: bool, width: int) -> Picture:
-    strip = np.full((5 * LINE_HEIGHT, width, 3), BACKGROUND, dtype=np.uint8)
+def _text_strip(
+    scene: Scene, estimate: Estimate, truth: ArrayLike | None, explanation: Explanation | None, title: str, has_mask: bool, width: int
+) -> Picture:
+    size = min(1.0, width / (2 * NARROWEST_PICTURE))
+    strip = _canvas(TEXT_LINES * int(LINE_HEIGHT * size), width)
     fallback = "estimate: box centre, as NN_e's state lies outside" if estimate.used_fallback else ""
     boundary = "box reaches the domain's face" if estimate.touches_boundary else ""
-    _write(strip, 0, [(title, TEXT), _outcome(estimate), (_cells(scene, estimate), TEXT), (fallback, TEXT), (boundary, TEXT)])
+    lines = [[(title, TEXT), _outcome(estimate), (_cells(scene, estimate), TEXT), (fallback, TEXT), (boundary, TEXT)], [], [], []]
     if estimate.box is not None:
-        _write(strip, 1, [("certified box", BOX), *((text, TEXT) for text in _ranges(estimate.box))])
-    for line, (name, state, colour) in enumerate((("estimate", estimate.state, STATE), ("truth", truth, TRUTH)), start=2):
-        if state is not None:
-            _write(strip, line, [(name, colour), *((text, TEXT) for text in _numbers(np.asarray(state)))])
-    _write(strip, 4, [("lit", FRAME), ("filtered", FILTERED), (f"S of cell {estimate.cell}" if has_mask else "", MASK_TEXT)])
+        lines[1] = [("certified box", BOX), *((text, TEXT) for text in _ranges(estimate.box))]
+    if explanation is not None:
+        lines[1] = [(explanation.reason.value, NO_RUNWAY), (_shortened(explanation.count_text()), TEXT)]
+        lines[2] = [("nearest, not certified", NEAREST), *((text, TEXT) for text in _numbers(explanation.nearest.state))]
+    if estimate.state is not None:
+        lines[2] = [("estimate", STATE), *((text, TEXT) for text in _numbers(estimate.state))]
+    if truth is not None:
+        lines[3] = [("truth", TRUTH), *((text, TEXT) for text in _numbers(np.asarray(truth)))]
+    dark = "" if truth is None and explanation is None else "runway, dark"
+    lines.append([("lit", FRAME), ("filtered", FILTERED), (f"S of cell {estimate.cell}" if has_mask else "", MASK_TEXT), (dark, NO_RUNWAY)])
+    for line, parts in enumerate(lines):
+        _write(strip, line, parts, size)
     return strip
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= LONGEST_TEXT else f"{text[: LONGEST_TEXT - 3]}..."
 
 
 def _outcome(estimate: Estimate) -> tuple[str, Colour]:
@@ -298,7 +389,8 @@ def _outcome(estimate: Estimate) -> tuple[str, Colour]:
 
 
 def _cells(scene: Scene, estimate: Estimate) -> str:
-    return f"cell {estimate.cell}, {len(estimate.passing)} of {scene.domain.cell_count} pass"
+    refuted = "" if estimate.certified or len(estimate.passing) == 0 else ", all refuted by the refinement"
+    return f"cell {estimate.cell}, {len(estimate.passing)} of {scene.domain.cell_count} pass NN_F{refuted}"
 
 
 def _numbers(state: NDArray[np.float64]) -> list[str]:
@@ -310,15 +402,11 @@ def _ranges(box: Box) -> list[str]:
     return [f"{name} {low:.4f} to {high:.4f} {unit}" for name, low, high, unit in rows]
 
 
-def _write(strip: Picture, line: int, parts: Sequence[tuple[str, Colour]]) -> None:
-    """Texts from left to right on one line of the strip, each in its colour; empty ones take no room."""
-    left = 8
+def _write(strip: Picture, line: int, parts: Sequence[tuple[str, Colour]], size: float = 1.0) -> None:
+    """Texts from left to right on one line of the strip, each in its colour; empty ones take no room. `size`: 1 for pictures."""
+    left, font = int(8 * size), 0.5 * size
     for text, colour in parts:
         if text:
-            cv2.putText(strip, text, (left, line * LINE_HEIGHT + 17), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)
-            left += cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)[0][0] + 18
-
-
-def png(picture: Picture) -> bytes:
-    """The picture as a PNG file."""
-    return cv2.imencode(".png", picture)[1].tobytes()
+            place = left, int((line * LINE_HEIGHT + 17) * size)
+            cv2.putText(strip, text, place, cv2.FONT_HERSHEY_SIMPLEX, font, colour, 1, cv2.LINE_AA)
+            left += cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, font, 1)[0][0] + int(18 * size)

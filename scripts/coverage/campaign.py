@@ -21,7 +21,6 @@ from typing import Annotated, Any
 
 import joblib
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn, track
 from rich.table import Table
 
@@ -30,7 +29,7 @@ from coverage.journal import ResultJournal
 from coverage.judge import HALF_WIDTHS, Tally, Violation, quantile
 from coverage.models import DERIVED, build_model
 from coverage.scenarios import Scenario, scenarios
-from runtime import Estimator
+from runtime import Estimator, terminal
 from runtime.whole_file import write_whole
 
 CHUNK = 250
@@ -69,7 +68,7 @@ def run_campaign(chunks: list[Chunk], journal: Journal, jobs: int) -> None:
     missing = [chunk for chunk in chunks if chunk.key not in journal.done]
     found_so_far = TextColumn("{task.fields[violations]} violations")
     columns = (TextColumn("frames"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), found_so_far)
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    with Progress(*columns, console=terminal.console(stderr=True)) as bar:
         found = sum(len(violations) for _, violations in journal.done.values())
         done = sum(chunk.frames for chunk in chunks) - sum(chunk.frames for chunk in missing)
         task = bar.add_task("frames", total=sum(chunk.frames for chunk in chunks), completed=done, violations=found)
@@ -114,7 +113,7 @@ def report(chunks: list[Chunk], journal: Journal, output: Path) -> int:
         tally, found = journal.done[chunk.key]
         results[chunk.scenario.name] = results.get(chunk.scenario.name, Tally()) + tally
         violations += found
-    Console(width=220).print(table(results))
+    terminal.console(220).print(table(results))
     for each in violations[:20]:
         print(f'{each.fault}\n    state {each.state}\n    --seed {each.seed} --replay "{each.scenario}#{each.number}"')
     tables = {"scenarios": {name: summary(tally) for name, tally in results.items()}, "violations": [asdict(each) for each in violations]}
@@ -170,7 +169,7 @@ def main(
         chosen = [scenario_named(name, chosen) for name in dict.fromkeys(only)]
     models = {"given": model}
     for name in track(
-        [name for name in DERIVED if name in {scenario.model for scenario in chosen}], "models", console=Console(stderr=True)
+        [name for name in DERIVED if name in {scenario.model for scenario in chosen}], "models", console=terminal.console(stderr=True)
     ):
         models[name] = build_model(given.scene, name, output.parent, jobs)
     chunks = chunks_of(models, chosen, frames, recording, seed)

@@ -3,10 +3,9 @@
 import sys
 from pathlib import Path
 
-import typer
-
 if __name__ == "__main__":
     sys.path.insert(0, str(Path(__file__).parents[1]))  # Python puts this folder there, not the one that holds the packages
     from random_scenes.campaign import main
+    from runtime import terminal
 
-    typer.run(main)
+    terminal.run(main)

@@ -27,7 +27,6 @@ import typer
 from coverage.chunk import digest
 from coverage.journal import ResultJournal
 from import_graph import all_imports_of
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -35,6 +34,7 @@ import runtime
 from random_scenes.outcomes import Finding, Outcomes
 from random_scenes.sights import PLACES
 from random_scenes.trial import Trial
+from runtime import terminal
 from runtime.whole_file import write_whole
 
 MOST_MEMORY_BYTES = 4 * 2**30
@@ -119,7 +119,7 @@ def run_campaign(campaign: Campaign, journal: ResultJournal[Outcomes], jobs: int
     trials = campaign.trials
     missing = [trial for trial in trials if trial.key not in journal.done]
     columns = (TextColumn("scenes"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), TextColumn("{task.fields[found]} findings"))
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    with Progress(*columns, console=terminal.console(stderr=True)) as bar:
         found = sum(len(outcomes.findings) for outcomes in journal.done.values())
         task = bar.add_task("scenes", total=len(trials), completed=len(trials) - len(missing), found=found)
         for trial, outcomes in outcomes_of(missing, jobs):
@@ -163,7 +163,7 @@ def report(campaign: Campaign, journal: ResultJournal[Outcomes], output: Path) -
     total = Outcomes()
     for trial in campaign.trials:
         total.add(journal.done[trial.key])
-    console = Console(width=200)
+    console = terminal.console(200)
     console.print(table_of_kinds(total.counts))
     print(f"seed {campaign.seed}; {total.refused.total()} draws refused: {dict(total.refused.most_common())}")
     if total.findings:
@@ -220,7 +220,3 @@ def main(
         print(f"stopped: {len(journal.done)} of {scenes} scenes are kept in {journal.path}; the same command goes on", file=sys.stderr)
         sys.exit(130)
     sys.exit(int(report(campaign, journal, output) > 0))
-
-
-if __name__ == "__main__":
-    typer.run(main)

@@ -126,6 +126,16 @@ def test_missing_files_are_one_line(run: Run, scene_file: Path, tmp_path: Path) 
     assert models_in(tmp_path) == set()
 
 
+def test_a_folder_gets_a_model_of_the_scenes_name(run: Run, scene_file: Path, tmp_path: Path) -> None:
+    """Also the one that the user stands in, and one whose name looks like markup."""
+    (tmp_path / "run[" / "]x").mkdir(parents=True)
+    for folder in (".", "run[/]x"):
+        result = run(scene_file.name, "-o", folder, "--jobs", 1)
+        assert result.returncode == 0, result.stderr
+        assert f"{Path(folder) / 'field.onnx'}" in result.stdout
+        assert (tmp_path / folder / "field.onnx").is_file()
+
+
 def test_a_full_disk_leaves_the_old_model(run: Run, scene_file: Path, tmp_path: Path) -> None:
     """The system's limit on the size of a file stands for the disk."""
     (tmp_path / "model.onnx").write_bytes(b"old")
