@@ -2,9 +2,9 @@
 
     xi-hat = NN_e(NN_F(I))  if it lies in Xi-hat,  else  centre(Xi-hat)
 
-Xi-hat is the hull of the bank entries that pass, contracted to what the frame can tell. By Theorem A it contains the aircraft's state whatever the clutter, if the state
-lies in the scene's domain, the camera is the scene's (no roll or yaw, the calibration as stated, up to the tolerance), and at most
-`missed_budget` pixels of the runway's image are dark (up to the tolerance).
+Xi-hat is the hull of the bank entries that pass, contracted to what the frame can tell. By Theorem A it contains the aircraft's state
+whatever the clutter, if the state lies in the scene's domain, the camera is the scene's (no roll or yaw, the calibration as stated, up to
+the tolerance), and at most `missed_budget` pixels of the runway's image are dark (up to the tolerance).
 """
 
 from __future__ import annotations
