@@ -6,17 +6,22 @@ from pathlib import Path
 
 import numpy as np
 import onnx
-import onnx.shape_inference
 import onnx.version_converter
 from onnx import TensorProto, helper, numpy_helper
 
 from runtime.errors import one_line
 from runtime.model.format import OPSET, ModelError
 from runtime.model.onnx_subset import check_graph
+from runtime.model.operators.table import OPERATORS, Attribute
+from runtime.model.operators.tensor import LARGEST_RANK
 from runtime.scene import Scene
 
 CONSTANT_VALUES = {"value": None, "value_float": np.float32, "value_floats": np.float32, "value_int": np.int64, "value_ints": np.int64}
 """How a Constant may hold its value: as a tensor, or as numbers of the type given."""
+OLDEST_OPSET = 13
+"""Oldest operator set of a user's network: since then what decides a shape is an input, but for the axes of reductions."""
+AXES = Attribute(tuple, None, -LARGEST_RANK, LARGEST_RANK - 1)
+"""Of a reduction, in operator sets before 18."""
 
 
 class EstimatorError(ValueError):
@@ -24,19 +29,14 @@ class EstimatorError(ValueError):
 
 
 def user_network(scene: Scene, path: Path) -> onnx.GraphProto:
-    """A user's NN_e, its constants as initialisers of raw bytes, as the runtime wants them.
+    """A user's NN_e in the operator set of the model, its constants as initialisers of raw bytes, as the runtime wants them.
 
     Raises `EstimatorError` unless it maps float32 [1, 1, height, width] to float32 [1, 4], with fixed shapes throughout and nothing that
-    the runtime would refuse (`runtime.model.model_file`).
+    the runtime would refuse (`runtime.model.operators`); onnx's own code is given no network that was not checked.
     """
     try:
         model = onnx.load(path, load_external_data=False)
-        onnx.checker.check_model(model)
-        model = onnx.version_converter.convert_version(model, OPSET) if model.opset_import[0].version != OPSET else model
-        graph = _with_plain_constants(model.graph)
-        shapes = onnx.shape_inference.infer_shapes(
-            helper.make_model(graph, opset_imports=model.opset_import), strict_mode=True, data_prop=True
-        )
+        graph = bare(_with_plain_constants(_converted(model)))
     except OSError as error:
         raise EstimatorError(f"{path}: cannot be read ({error.strerror}); give the path of an ONNX file") from error
     except Exception as error:  # onnx's parser, checker and converter raise classes that share only this one
@@ -48,14 +48,39 @@ def user_network(scene: Scene, path: Path) -> onnx.GraphProto:
     wanted = [f"FLOAT {[1, 1, *scene.camera.shape]}"], [f"FLOAT {[1, 4]}"]
     if ([_described(value) for value in inputs], [_described(value) for value in graph.output]) != wanted:
         raise EstimatorError(f"{path}: found {found}; expected {expected}")
-    if any(domain.domain not in ("", "ai.onnx") for domain in model.opset_import) or model.functions:
-        raise EstimatorError(f"{path}: found operators or functions of its own; expected standard operators only")
-    _check_static(path, shapes.graph)
     try:
-        check_graph(bare(graph).SerializeToString())
+        check_graph(graph.SerializeToString())
     except ModelError as error:
         raise EstimatorError(f"{path}: {error}") from error
     return graph
+
+
+def _converted(model: onnx.ModelProto) -> onnx.GraphProto:
+    """The network in the model's operator set. Raises ValueError, or what onnx raises, for one that cannot be converted."""
+    versions = [opset.version for opset in model.opset_import if opset.domain in ("", "ai.onnx")]
+    if len(versions) != 1 or len(model.opset_import) != 1 or model.functions:
+        raise ValueError("expected standard operators only, of one operator set, and no functions")
+    if versions == [OPSET]:
+        return model.graph
+    if versions[0] < OLDEST_OPSET:
+        raise ValueError(f"operator set {versions[0]}; export the network with {OLDEST_OPSET} or a later one")
+    plain = helper.make_model(_with_plain_constants(model.graph), opset_imports=model.opset_import, ir_version=model.ir_version)
+    for node in plain.graph.node:
+        _check_convertible(node)
+    onnx.checker.check_model(plain)
+    return onnx.version_converter.convert_version(plain, OPSET).graph
+
+
+def _check_convertible(node: onnx.NodeProto) -> None:
+    """Raises ValueError for an operator or an attribute that no operator set has so: onnx's converter may end the process there."""
+    if node.op_type not in OPERATORS:
+        raise ValueError(f"found the operator {node.op_type}; static, standard operators only are taken")
+    known = {"axes": AXES, **OPERATORS[node.op_type].attributes}
+    for attribute in node.attribute:
+        value = helper.get_attribute_value(attribute)
+        value = value.decode() if isinstance(value, bytes) else tuple(value) if isinstance(value, list) else value
+        if attribute.name not in known or not known[attribute.name].takes(value):
+            raise ValueError(f"found {node.op_type} with {attribute.name} = {value!s:.60}")
 
 
 def _with_plain_constants(graph: onnx.GraphProto) -> onnx.GraphProto:
@@ -75,23 +100,6 @@ def _with_plain_constants(graph: onnx.GraphProto) -> onnx.GraphProto:
     for value in [value for value in plain.input if value.name in given]:
         plain.input.remove(value)
     return plain
-
-
-def _check_static(path: Path, inferred: onnx.GraphProto) -> None:
-    """Raises `EstimatorError` unless every tensor between the nodes has a fixed shape."""
-    values = {value.name: value for value in (*inferred.value_info, *inferred.output)}
-    for node in inferred.node:
-        for name in filter(None, node.output):
-            shown = _described(values[name]) if name in values else "of unknown shape"
-            dims = values[name].type.tensor_type.shape.dim if name in values else []
-            if (
-                name not in values
-                or not values[name].type.tensor_type.HasField("shape")
-                or not all(dim.HasField("dim_value") for dim in dims)
-            ):
-                raise EstimatorError(
-                    f"{path}: found {name!r} ({node.op_type}), {shown}; expected fixed shapes throughout: export it with them"
-                )
 
 
 def _described(value: onnx.ValueInfoProto) -> str:

@@ -43,6 +43,8 @@ MARGIN_PX = 2.0**-20
 ROUNDED_SHARE_OF_COLUMN, ROUNDED_SHARE_OF_DISTANCE = 2.0**-51, 2.0**-52
 """What float64 loses at most: on a column, of |u - u0| |v - v0| over the row's distance from the horizon, as the scale there is rounded
 (four units in the last place of 1); and on a distance, of the largest coordinate along the runway (two sums)."""
+MOST_ITEMS = 2**12
+"""Markings, and cells along an axis, that are read: a tenth of a second's work."""
 LONGEST_FOUND = 200
 """Characters of a faulty value that an error quotes."""
 
@@ -391,6 +393,7 @@ def _read_table(kind: Any, table: Any, key: str) -> Any:
 
 def _read_tuple(kinds: tuple[Any, ...], value: Any, key: str) -> tuple[Any, ...]:
     _demand(isinstance(value, list), key, repr(value), "give a list")
+    _demand(len(value) <= MOST_ITEMS, key, f"{len(value)} values", f"give {MOST_ITEMS} or fewer")
     if kinds[-1] is not Ellipsis:
         _demand(len(value) == len(kinds), key, value, f"give {len(kinds)} values")
     return tuple(_read(kinds[0], item, f"{key}[{position}]") for position, item in enumerate(value))

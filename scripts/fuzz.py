@@ -2,14 +2,15 @@
 
     python scripts/fuzz.py --minutes 10
 
-Targets: `Estimator.load` with model files, `Scene.load` with scene files, `read_events` with recordings of every kind (then
-`FrameStream`), `events_to_frames` with arrays of any type. Inputs are valid ones with bytes changed, cut or repeated; model files also
-with lengths, dims, attributes, constants and metadata changed as an attacker would, their digests recomputed; scene files with numbers
-and keys replaced.
+Targets: `Estimator.load` with model files; networks as `export-model --estimator` takes them (`scripts/fuzz_networks.py`); `Scene.load`
+with scene files; `read_events` with recordings of every kind (then `FrameStream`); `events_to_frames` with arrays of any type. Inputs
+are valid ones with bytes changed, cut or repeated; model files also with lengths, dims, attributes, constants, nodes and metadata
+changed as an attacker would, their digests recomputed; scene files with numbers and keys replaced.
 
-Cases run in a worker process with a limit on its memory. A case that raises another error than ours, takes longer than `CASE_SECONDS`, or
-ends the worker (a crash, or memory beyond the limit) is a finding: its input and its traceback are kept in the output folder, and the
-exit code is 1. Each case has a number: the same seed and number give the same input.
+Cases run in a worker process with a limit on its memory. A case that raises another error than ours, takes longer than `CASE_SECONDS`,
+takes the processor for longer than `LOAD_SECONDS` to load or refuse a model, or ends the worker (a crash, or memory beyond the limit) is
+a finding: its input and its traceback are kept in the output folder, and the exit code is 1. Each case has a number: the same seed and
+number give the same input.
 """
 
 from __future__ import annotations
@@ -34,9 +35,11 @@ from typing import Any
 import h5py
 import numpy as np
 import onnx
+from fuzz_networks import CHAINED, CHAINS, fuzzed_network, run_network, with_chain, with_network
 from onnx import TensorProto, helper, numpy_helper
 from onnx.checker import ValidationError
 
+from build_model.user_network import EstimatorError
 from runtime import Estimator, FrameError, FrameStream, ModelError, SceneError, terminal
 from runtime.frames import EventError, events_to_frames
 from runtime.model.model_file import METADATA_KEY, metadata_digest
@@ -45,9 +48,11 @@ from runtime.scene import Scene
 
 CASE_SECONDS = 60
 """A case that takes longer hangs; an AEDAT4 file, read by processes of their own, takes 20 s on a machine that is busy otherwise."""
+LOAD_SECONDS = 2
+"""Processor time that loading or refusing a model may take."""
 MEMORY_BYTES = 4 * 2**30
 """Address space of a worker: several times what a valid file takes, of which onnxruntime's threads and libraries reserve much."""
-OWN_ERRORS = (ModelError, SceneError, RecordingError, EventError, FrameError)
+OWN_ERRORS = (ModelError, SceneError, RecordingError, EventError, FrameError, EstimatorError)
 SHAPE = (10, 20)
 FAERY_KINDS: dict[str, Any] = {".evt2.raw": "evt2", ".evt3.raw": "evt3", ".dat": "dat2", ".es": None, ".aedat4": None, ".csv": None}
 """Recordings that faery writes: the end of a name, and faery's name of the version."""
@@ -185,6 +190,14 @@ def _operator(rng: Random, model: onnx.ModelProto, _metadata: dict[str, Any]) ->
     )
 
 
+def _network(rng: Random, model: onnx.ModelProto, _metadata: dict[str, Any]) -> None:
+    """Another NN_e, or a longer one."""
+    if rng.random() < 0.7:
+        with_network(model, fuzzed_network(rng))
+    else:
+        with_chain(model, _pick(rng, CHAINED), int(_pick(rng, CHAINS)))
+
+
 def _wiring(rng: Random, model: onnx.ModelProto, _metadata: dict[str, Any]) -> None:
     node, other = _pick(rng, model.graph.node), _pick(rng, model.graph.node)
     kind = rng.integers(4)
@@ -250,6 +263,7 @@ MODEL_CHANGES: tuple[Callable[[Random, onnx.ModelProto, dict[str, Any]], None], 
     _constant,
     _attribute,
     _operator,
+    _network,
     _wiring,
     _interface,
     _foreign,
@@ -257,7 +271,12 @@ MODEL_CHANGES: tuple[Callable[[Random, onnx.ModelProto, dict[str, Any]], None], 
 )
 
 
-# --- scene files, recordings, arrays of events ---
+# --- networks, scene files, recordings, arrays of events ---
+
+
+def fuzzed_estimator(rng: Random, _seeds: dict[str, bytes]) -> Case:
+    """A network of a user's."""
+    return ".onnx", fuzzed_network(rng).SerializeToString()
 
 
 def fuzzed_scene(rng: Random, seeds: dict[str, bytes]) -> Case:
@@ -311,7 +330,12 @@ def events_of(content: bytes) -> tuple[np.ndarray, dict[str, Any]]:
 
 def load_model(path: Path) -> None:
     """Loads the model and, if it is accepted, estimates from two frames."""
-    estimator = Estimator.load(path)
+    start = time.process_time()
+    try:
+        estimator = Estimator.load(path)
+    finally:
+        if (spent := time.process_time() - start) > LOAD_SECONDS:
+            raise RuntimeError(f"loaded or refused after more than {LOAD_SECONDS} s") from TimeoutError(f"{spent:.1f} s")
     for frame in (np.zeros(estimator.scene.camera.shape, dtype=np.uint8), np.ones(estimator.scene.camera.shape, dtype=np.uint8)):
         estimator.run(frame)
 
@@ -340,6 +364,7 @@ def make_frames(path: Path) -> None:
 
 TARGETS: dict[str, tuple[Callable[[Random, dict[str, bytes]], Case], Callable[[Path], None]]] = {
     "model": (fuzzed_model, load_model),
+    "network": (fuzzed_estimator, run_network),
     "scene": (fuzzed_scene, load_scene),
     "recording": (fuzzed_recording, read_recording),
     "events": (fuzzed_events, make_frames),

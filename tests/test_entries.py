@@ -114,6 +114,24 @@ def test_a_claim_that_the_refinement_cannot_rely_on_is_refused(paper: tuple[Scen
     assert str(caught.value).isprintable()
 
 
+def test_constants_that_do_not_fit_the_scene_are_refused(paper: tuple[Scene, Tensors]) -> None:
+    """Of another type or shape, or not finite; windows and masks out of the frame; cells without rows."""
+    scene, tensors = paper
+    cases: list[tuple[str, NDArray[Any], str]] = [
+        ("theta_lower", np.zeros((2, 3), dtype=np.float32), r"theta_lower is float32 \[2, 3\], its scene asks for float32 \[27, 127\]"),
+        ("line_lower", np.zeros((1, 9, 4), dtype=np.float32), "line_lower is float32"),
+        ("window_first", np.array([-1, 0]), "its window or its spatial masks lie outside the frame"),
+        ("window_stop", np.array([10_000, 10_000]), "its window or its spatial masks lie outside the frame"),
+        ("spatial_run_index", np.zeros(3, dtype=np.int32), "spatial_run_cell is int32"),
+        ("spatial_run_index", tensors["spatial_run_index"] + np.int32(2**20), "its window or its spatial masks lie outside the frame"),
+        ("reference_row", np.full(tensors["reference_row"].shape, np.nan), "not finite"),
+        ("row_cell", np.zeros(27, dtype=np.int32), "row_cell does not give rows to every one of 27 cells"),
+    ]
+    for name, values, message in cases:
+        with pytest.raises(ModelError, match=message):
+            Entries.of(scene, {**tensors, name: values}, "model")
+
+
 def test_a_reference_row_at_the_horizon_is_refused(paper: tuple[Scene, Tensors]) -> None:
     """By a principal point that puts the horizon into view; half a pixel below it is taken, if only the scales were such."""
     scene, tensors = paper

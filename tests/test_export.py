@@ -346,7 +346,7 @@ DYNAMIC_INSIDE = {
             helper.make_node("Slice", ["image", "zero", "first_row", "two"], ["cut"]),
             helper.make_node("ReduceSum", ["cut"], ["sum"], keepdims=0),
         ],
-        r"found 'cut' \(Slice\), FLOAT \[.*'.*'\]; expected fixed shapes throughout",
+        "found Slice with a shape that is computed; only constant shapes are taken",
     ),
     "as many as are lit": (
         [
@@ -354,7 +354,7 @@ DYNAMIC_INSIDE = {
             helper.make_node("Cast", ["places"], ["numbers"], to=TensorProto.FLOAT),
             helper.make_node("ReduceSum", ["numbers"], ["sum"], keepdims=0),
         ],
-        r"found 'places' \(NonZero\), INT64 \[4, '.*'\]; expected fixed shapes throughout",
+        "found the operator NonZero; a model has static, standard operators only",
     ),
 }
 

@@ -206,6 +206,8 @@ BAD_VALUES: list[tuple[KeyPath, Any, str]] = [
     ((*MARKING, "x_m"), 1e300, "runway.markings 'L' x_m: found 1e+300"),
     ((*MARKING, "name"), "R", "runway.markings name: found ['R', 'R']"),
     (("runway", "markings"), [], "runway.markings: found none"),
+    (("runway", "markings"), [{}] * 5000, "runway.markings: found 5000 values; give 4096 or fewer"),
+    (("domain", "z_m", "centres"), [1.0] * 5000, "domain.z_m.centres: found 5000 values"),
     (("bank", "pitch_bins"), 0, "bank.pitch_bins: found 0"),
     (("bank", "distance_bins"), 1001, "bank.distance_bins: found 1001"),
     (("bank", "lateral_px"), 0.0, "bank.lateral_px: found 0.0"),

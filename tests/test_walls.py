@@ -30,6 +30,13 @@ SHARED_WITH_VERIFIER = {
     "runtime.model.limits",  # numbers
     "runtime.model.model_file",
     "runtime.model.onnx_subset",
+    "runtime.model.operators",  # what a graph may hold
+    "runtime.model.operators.elementwise",
+    "runtime.model.operators.graph",
+    "runtime.model.operators.layout",
+    "runtime.model.operators.products",
+    "runtime.model.operators.table",
+    "runtime.model.operators.tensor",
     "runtime.model.protobuf",
     "runtime.scene",
     "runtime.terminal",  # what the command prints on

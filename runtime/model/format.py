@@ -15,6 +15,7 @@ FORMAT_VERSION = 1
 METADATA_KEY = "glideproof"
 """Of the ONNX file's metadata_props: JSON with the scene, the digests and what else a user must know."""
 OPSET = 20
+"""Version of the standard operators that export-model writes and the runtime takes."""
 IR_VERSION = 10
 
 FRAME = "frame"

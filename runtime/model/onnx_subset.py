@@ -1,63 +1,30 @@
-"""The ONNX that a model file may hold: its messages, operators and constants; and the check of a graph against them.
+"""The ONNX that a model file may hold: its messages, and the check of a graph before onnxruntime sees it.
 
 An ONNX file is a Protocol Buffers message, `ModelProto`. Only the fields that export-model writes are known here, and whatever else a
 file holds is refused by name: weights in other files, sparse or typed tensors, functions, graphs within nodes, operators of other
 domains. So everything that a file declares is there: a constant has the bytes that its shape and type ask for, and no operator makes a
-tensor from a mere number.
-
-What a graph may hold, all of it checked before onnxruntime sees the file:
-
-- operators of `OPERATORS`: the output's shape follows from shapes and constants, and no value is made from a shape;
-- their shape operands (`SHAPE_OPERANDS`) are constants, so that every shape is known before a frame is;
-- attributes are numbers and texts, and constants are raw bytes of the types in `DTYPES`.
+tensor from a mere number. What operators do with them, and how large the whole may be, is said and checked in `runtime.model.operators`.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Iterable
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.model.format import ModelError
-from runtime.model.protobuf import Fields, Message, Reader, only_of, packed, parts_of, shown, text_of
+from runtime.model.format import OPSET, ModelError
+from runtime.model.operators.graph import MOST_NODES, Node, check_nodes
+from runtime.model.operators.table import standard_operator
+from runtime.model.operators.tensor import DTYPES, LARGEST_RANK, Tensor
+from runtime.model.protobuf import Message, Reader, number_of, numbers_of, only_of, parts_of, shown, text_of
 
-LARGEST_RANK = 8
-OLDEST_OPSET = 13
-"""Oldest version of the standard operators that is taken: since then what decides a shape is an input, not an attribute."""
-LARGEST_PADDING = 2**28
-"""Largest factor by which the constants of a Pad may enlarge a tensor: a frame of the largest camera around a single pixel."""
-DTYPES = {1: "<f4", 2: "|u1", 3: "|i1", 4: "<u2", 5: "<i2", 6: "<i4", 7: "<i8", 9: "|b1", 10: "<f2", 11: "<f8", 12: "<u4", 13: "<u8"}
-"""onnx's numbers of the element types that a constant may have: numbers of a fixed size."""
-
-ARITHMETIC = (
-    "Abs Add Ceil Clip Cos Div Erf Exp Floor Log Max Mean Min Mod Mul Neg Pow Reciprocal Round Sign Sin Sqrt Sub Sum "
-    "And Equal Greater GreaterOrEqual Less LessOrEqual Not Or Where Xor Cast Identity"
-)
-REDUCTIONS = (
-    "ArgMax ArgMin CumSum "
-    "ReduceL1 ReduceL2 ReduceLogSum ReduceLogSumExp ReduceMax ReduceMean ReduceMin ReduceProd ReduceSum ReduceSumSquare"
-)
-LAYOUT = (
-    "Concat DepthToSpace Flatten Gather GatherElements GatherND Pad Reshape ScatterElements Slice SpaceToDepth Split Squeeze "
-    "Transpose Unsqueeze"
-)
-LAYERS = (
-    "AveragePool BatchNormalization Celu Conv Dropout Elu Gelu Gemm GlobalAveragePool GlobalMaxPool HardSigmoid "
-    "HardSwish InstanceNormalization LRN LayerNormalization LeakyRelu LogSoftmax LpNormalization LpPool MatMul MaxPool Mish PRelu Relu "
-    "Selu Sigmoid Softmax Softplus Softsign Tanh ThresholdedRelu "
-    "ConvInteger DequantizeLinear DynamicQuantizeLinear MatMulInteger QLinearConv QLinearMatMul QuantizeLinear"
-)
-OPERATORS = frozenset(" ".join((ARITHMETIC, REDUCTIONS, LAYOUT, LAYERS)).split())
-"""Operators of the default domain that a model may use: those of NN_F, and those of feed-forward networks.
-
-Left out on purpose: control flow; operators that make a tensor of a given size (ConstantOfShape, Expand, OneHot, Range, Resize, Tile);
-whose output's size depends on values (Compress, NonZero, Unique); that are random, or work on texts and sequences.
-"""
-SHAPE_OPERANDS = {"Pad": (1, 3), "Reshape": (1,), "Slice": (1, 2, 3, 4), "Split": (1,), "Squeeze": (1,), "Unsqueeze": (1,)}
-SHAPE_OPERANDS |= {name: (1,) for name in REDUCTIONS.split() if name.startswith("Reduce")}
-"""Places of the inputs that decide the shape of an operator's output."""
+MOST_VALUES = 2**13
+"""Constants, inputs and outputs of a graph, each."""
+MOST_NUMBERS = 4 * LARGEST_RANK
+"""Numbers of a shape or an attribute that are read: twice as many as any has."""
 
 MODEL = Message(
     "a file",
@@ -86,13 +53,22 @@ TENSOR = Message(
     | {14: "data_location"},
 )
 PROPERTY = Message("metadata_props", {1: "key", 2: "value"}, {}, {})
-OPSET = Message("opset_import", {1: "domain", 2: "version"}, {}, {})
+OPSET_IMPORT = Message("opset_import", {1: "domain", 2: "version"}, {}, {})
+VALUE = Message("an input or output", {1: "name", 2: "type"}, {}, {})
+TYPE = Message("a type", {1: "tensor_type"}, {}, {4: "a sequence", 5: "a map", 8: "a sparse tensor", 9: "an optional value"})
+TENSOR_TYPE = Message("a tensor's type", {1: "elem_type", 2: "shape"}, {}, {})
+SHAPE = Message("a shape", {}, {1: "dim"}, {})
+DIMENSION = Message("a dimension", {1: "dim_value"}, {}, {2: "a name for any size", 3: "a denotation"})
+VALUE_FIELDS = {1: "f", 2: "i", 3: "s", 7: "ints"}
+"""The field of an attribute that holds its value, by onnx's number of the attribute's type."""
+
+Named = TypeVar("Named")
 
 
-def check_graph(graph: bytes) -> None:
-    """Raises `ModelError` unless a serialised GraphProto holds nothing but what a model may hold (see above)."""
+def check_graph(graph: bytes) -> dict[str, Tensor]:
+    """What is known of every tensor of a serialised GraphProto, by name. Raises `ModelError` if it holds what a model may not hold."""
     try:
-        checked_graph(Reader(), memoryview(graph))
+        return checked_graph(Reader(), memoryview(graph))[1]
     except (IndexError, ValueError) as error:
         raise error if isinstance(error, ModelError) else ModelError("found a graph that cannot be read; export it again") from error
 
@@ -104,67 +80,98 @@ def file_parts(reader: Reader, model: memoryview) -> tuple[memoryview, dict[str,
     for entry in parts_of(fields["metadata_props"]):
         pair = reader.known(entry, PROPERTY)
         properties[text_of(pair["key"])] = bytes(only_of(pair["value"]))
-    opsets = [reader.known(entry, OPSET) for entry in parts_of(fields["opset_import"])]
+    opsets = [reader.known(entry, OPSET_IMPORT) for entry in parts_of(fields["opset_import"])]
     versions = [(text_of(opset["domain"]), *(int(part) for part in opset["version"] if isinstance(part, int))) for opset in opsets]
-    if not (len(versions) == 1 and versions[0][0] == "" and versions[0][1:] >= (OLDEST_OPSET,)):
-        rest.append(f"operator sets {shown(str(versions))}")
+    if versions != [("", OPSET)]:
+        rest.append(f"operator sets {shown(str(versions))}, not the standard one, version {OPSET}")
     return only_of(fields["graph"]), properties, rest
 
 
-def checked_graph(reader: Reader, graph: memoryview) -> dict[str, NDArray[Any]]:
-    """The constants of a graph that holds nothing but what a model may hold. Raises ValueError and IndexError too."""
+def checked_graph(reader: Reader, graph: memoryview) -> tuple[dict[str, NDArray[Any]], dict[str, Tensor]]:
+    """The constants of a graph that holds nothing but what a model may hold, and what is known of all its tensors.
+
+    Raises ValueError and IndexError too.
+    """
     fields = reader.known(graph, GRAPH)
-    constants: dict[str, NDArray[Any]] = {}
-    for message in parts_of(fields["initializer"]):
-        tensor = reader.known(message, TENSOR)
-        label = text_of(tensor["name"])
-        if label in constants:
-            raise ModelError(f"found two constants {shown(label)}; export it again with export-model")
-        constants[label] = _array(label, tensor)
-    for message in parts_of(fields["node"]):
-        _check_node(reader, reader.known(message, NODE), constants)
-    return constants
+    for part, most in (("node", MOST_NODES), ("initializer", MOST_VALUES), ("input", MOST_VALUES), ("output", MOST_VALUES)):
+        if (count := len(fields[part])) > most:
+            raise ModelError(f"found a graph with {count} fields {part}; at most {most} are taken: use a smaller network")
+    constants = dict(_unique("constants", (_constant(reader, message) for message in parts_of(fields["initializer"]))))
+    given = {label: Tensor(array.dtype, array.shape, values=array) for label, array in constants.items()}
+    for label, stated in _unique("inputs", (_value(reader, message) for message in parts_of(fields["input"]))):
+        _check_stated("input", label, stated, given.get(label, stated))
+        given[label] = stated  # without values, which are the caller's even where a constant is their default
+    known = check_nodes([_node(reader, message) for message in parts_of(fields["node"])], given)
+    for message in parts_of(fields["output"]):
+        label, stated = _value(reader, message)
+        _check_stated("output", label, stated, known.get(label))
+    return constants, known
 
 
-def _check_node(reader: Reader, node: Fields, constants: dict[str, NDArray[Any]]) -> None:
-    operator, domain = text_of(node["op_type"]), text_of(node["domain"]) + text_of(node["overload"])
-    if operator not in OPERATORS or domain:
-        found = f"operator {shown(operator)}" + (f" of {shown(domain)}" if domain else "")
-        raise ModelError(f"found the {found}; a model has static, standard operators only, without control flow")
-    attributes = [reader.known(attribute, ATTRIBUTE) for attribute in parts_of(node["attribute"])]
-    inputs = [bytes(part).decode() for part in parts_of(node["input"])]
-    for place in SHAPE_OPERANDS.get(operator, ()):
-        if place < len(inputs) and inputs[place] and inputs[place] not in constants:
-            raise ModelError(f"found {operator} with a shape that is computed, {shown(inputs[place])}; only constant shapes are taken")
-    if operator == "Split":
-        _check_split(len(node["output"]), attributes, constants.get(inputs[1]) if len(inputs) > 1 else None)
-    if operator == "Pad":
-        _check_padding(constants.get(inputs[1] if len(inputs) > 1 else "", np.zeros(0)))
+def _unique(kind: str, named: Iterable[tuple[str, Named]]) -> list[tuple[str, Named]]:
+    """The pairs. Raises `ModelError` if two have one name."""
+    pairs, names = [], set()
+    for name, value in named:
+        if name in names:
+            raise ModelError(f"found two {kind} {shown(name)}; export it again with export-model")
+        names.add(name)
+        pairs.append((name, value))
+    return pairs
 
 
-def _array(label: str, tensor: Fields) -> NDArray[Any]:
-    """The array of a TensorProto's fields, its data in place; its dims come one by one or packed. Raises `ModelError`."""
-    dims = [number for part in tensor["dims"] for number in ([part] if isinstance(part, int) else packed(part, LARGEST_RANK))]
-    (kind,), raw = tensor["data_type"] or (0,), only_of(tensor["raw_data"])
-    dtype = np.dtype(DTYPES.get(kind, "V")) if isinstance(kind, int) else np.dtype("V")
+def _check_stated(kind: str, name: str, stated: Tensor, known: Tensor | None) -> None:
+    """Raises `ModelError` unless an input's or output's type and shape are those that are known."""
+    if stated != known:
+        found = f"{shown(name)} stated as {stated} where it is {'missing' if known is None else known}"
+        raise ModelError(f"found the {kind} {found}; export it again with export-model")
+
+
+def _node(reader: Reader, message: memoryview) -> Node:
+    """A node with its attributes' values."""
+    node = reader.known(message, NODE)
+    operator = text_of(node["op_type"])
+    standard_operator(operator, text_of(node["domain"]) + text_of(node["overload"]))
+    attributes = _unique(f"attributes of {shown(operator)}", (_attribute(reader, attribute) for attribute in parts_of(node["attribute"])))
+    inputs, outputs = ([bytes(part).decode() for part in parts_of(node[side])] for side in ("input", "output"))
+    while outputs and not outputs[-1]:
+        outputs.pop()  # one that is left out
+    return Node(operator, tuple(inputs), tuple(outputs), dict(attributes))
+
+
+def _attribute(reader: Reader, message: memoryview) -> tuple[str, int | float | str | tuple[int, ...]]:
+    """Name and value of an attribute, which has one value, of the type that it states."""
+    attribute = reader.known(message, ATTRIBUTE)
+    name, kind = text_of(attribute["name"]), number_of(attribute["type"])
+    field = VALUE_FIELDS.get(kind, "")
+    if not field or any(attribute[other] for other in ("floats", "strings", *VALUE_FIELDS.values()) if other != field):
+        raise ModelError(f"found the attribute {shown(name)} of type {kind} with other values; export it again with export-model")
+    values = attribute[field]
+    if field == "s":
+        return name, text_of(values)
+    if field == "f":
+        return name, float(np.frombuffer(only_of(values) or bytes(4), "<f4").item())
+    return name, number_of(values) if field == "i" else tuple(numbers_of(values, MOST_NUMBERS))
+
+
+def _value(reader: Reader, message: memoryview) -> tuple[str, Tensor]:
+    """Name, type and shape of an input or output."""
+    value = reader.known(message, VALUE)
+    tensor = reader.known(only_of(reader.known(only_of(value["type"]), TYPE)["tensor_type"]), TENSOR_TYPE)
+    name, kind = text_of(value["name"]), number_of(tensor["elem_type"])
+    dims = [number_of(reader.known(dim, DIMENSION)["dim_value"]) for dim in parts_of(reader.known(only_of(tensor["shape"]), SHAPE)["dim"])]
+    if not tensor["shape"] or kind not in DTYPES or len(dims) > LARGEST_RANK or min(dims, default=1) < 1:
+        raise ModelError(f"found {shown(name)} of type {kind} and shape {shown(str(dims))}; export it again with fixed shapes throughout")
+    return name, Tensor(np.dtype(DTYPES[kind]), tuple(dims))
+
+
+def _constant(reader: Reader, message: memoryview) -> tuple[str, NDArray[Any]]:
+    """Name and array of a constant, its data in place. Raises `ModelError`."""
+    tensor = reader.known(message, TENSOR)
+    label, kind = text_of(tensor["name"]), number_of(tensor["data_type"])
+    dims, raw = numbers_of(tensor["dims"], MOST_NUMBERS), only_of(tensor["raw_data"])
+    dtype = np.dtype(DTYPES.get(kind, "V"))
     size = math.prod(dims) * dtype.itemsize
-    if dtype.kind == "V" or len(dims) > LARGEST_RANK or len(raw) != size or max(dims, default=0) >= 2**31:
+    if dtype.kind == "V" or len(dims) > LARGEST_RANK or len(raw) != size or not all(0 <= dim < 2**31 for dim in dims):
         found = f"shape {shown(str(dims))}, type {kind}, {len(raw)} bytes of data"
         raise ModelError(f"found the constant {shown(label)} with {found}, which do not fit or are not taken; export it again")
-    return np.frombuffer(raw, dtype=dtype).reshape(dims)
-
-
-def _check_padding(pads: NDArray[Any]) -> None:
-    """Raises `ModelError` if a Pad by these numbers, all befores and then all afters, can enlarge a tensor beyond the limit."""
-    axes = pads.astype(object).reshape(2, -1).T if pads.size <= 2 * LARGEST_RANK else []
-    if len(axes) == 0 or math.prod(1 + abs(before) + abs(after) for before, after in axes) > LARGEST_PADDING:
-        raise ModelError(f"found a Pad by {shown(str(pads))}; at most {LARGEST_PADDING} times the size is taken")
-
-
-def _check_split(outputs: int, attributes: list[Fields], sizes: NDArray[Any] | None) -> None:
-    """Raises `ModelError` unless a Split has as many outputs as it says: onnxruntime ends the process where it has more."""
-    stated = [part["i"][0] for part in attributes if text_of(part["name"]) == "num_outputs" and part["i"]]
-    if sizes is not None:
-        stated.append(sizes.size)
-    if any(number != outputs for number in stated):
-        raise ModelError(f"found a Split into {stated[0]} parts with {outputs} outputs; export it again with export-model")
+    return label, np.frombuffer(raw, dtype=dtype).reshape(dims)

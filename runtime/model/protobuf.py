@@ -6,13 +6,14 @@ So that the runtime needs no protobuf package, and a file is read once, in time 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
 
 from runtime.model.format import ModelError
 
-LARGEST_FIELDS = 2**20
-"""Fields that are read of one file, a second's work."""
+LARGEST_FIELDS = 2**18
+"""Fields that are read of one file, a fraction of a second's work."""
 LONGEST_VARINT = 10
 LONGEST_SHOWN = 60
 """Characters of a name from the file that an error quotes."""
@@ -69,15 +70,18 @@ class Reader:
         return found, rest
 
 
-def packed(part: memoryview, most: int) -> list[int]:
-    """The numbers of a packed field. Of more than `most` it reads one too many, and raises ValueError if that is not the last."""
-    values, position = [], 0
-    while position < len(part):
-        if len(values) > most:
-            raise ValueError("too many numbers in a field")
-        value, position = _varint(part, position)
-        values.append(value)
-    return values
+def number_of(values: list[Value]) -> int:
+    """The number of a field that occurs at most once, 0 without it. Raises ValueError if it is none."""
+    (value,) = values or [0]
+    if not isinstance(value, int):
+        raise ValueError("bytes in place of a number")
+    return _signed(value)
+
+
+def numbers_of(values: list[Value], most: int) -> list[int]:
+    """The numbers of a repeated field, one by one or packed; of very many only the first `most`."""
+    every = (value for part in values for value in ([part] if isinstance(part, int) else _packed(part)))
+    return [_signed(value) for value in itertools.islice(every, most)]
 
 
 def only_of(values: list[Value]) -> memoryview:
@@ -103,6 +107,18 @@ def shown(text: str) -> str:
     """A text from the file as an error quotes it: printable, and not too long."""
     plain = text if text.isprintable() else ascii(text)
     return plain if len(plain) <= LONGEST_SHOWN else f"{plain[:LONGEST_SHOWN]}..."
+
+
+def _packed(part: memoryview) -> Iterator[int]:
+    position = 0
+    while position < len(part):
+        value, position = _varint(part, position)
+        yield value
+
+
+def _signed(value: int) -> int:
+    """A varint as the 64 bits with a sign that it stands for."""
+    return (value & 2**64 - 1 ^ 2**63) - 2**63
 
 
 def _wire_fields(message: memoryview) -> Iterator[tuple[int, Value]]:
