@@ -231,7 +231,7 @@ def warned(estimate: Estimate) -> Estimate:
         (lambda estimate: replace(estimate, box=None, regions=(), state=None), "refined: no runway"),
         (without_a_column, "refined: filtered lacks pixels"),
         (endless, "a frame does not end"),
-        (warned, "RuntimeWarning in test_random_scenes.py"),
+        (warned, "RuntimeWarning in test_random_campaign.py"),
     ],
     ids=["narrow", "none", "filtered", "endless", "warned"],
 )
@@ -244,7 +244,7 @@ def test_what_must_not_be_is_found(
     assert findings[0].place.startswith("1/2.3#")
     if change is endless:
         assert len(findings) == 2
-        assert "test_random_scenes.py" in findings[0].detail
+        assert "test_random_campaign.py" in findings[0].detail
 
 
 def test_a_frame_is_slow_by_the_measure_of_its_scene(small: BuiltScene, rng: Rng) -> None:
@@ -261,7 +261,7 @@ def test_what_is_watched_ends_in_time_and_warns_of_nothing() -> None:
         endless()
     with pytest.raises(RuntimeWarning, match="a sum") as caught, watched(10):
         warnings.warn("a sum", RuntimeWarning, stacklevel=1)
-    assert "test_random_scenes.py" in described(caught.value)
+    assert "test_random_campaign.py" in described(caught.value)
 
 
 # --- the campaign ---
