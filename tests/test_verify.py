@@ -7,6 +7,7 @@ All checksums are recomputed.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import re
 from collections.abc import Callable, Iterator
@@ -776,6 +777,21 @@ def test_displacement_holds_every_camera_within_the_calibration() -> None:
     assert shift.max() <= bound
     assert shift.max() > 0.95 * bound
     assert displacement_px(SCENE, window) == 0
+
+
+def test_the_builds_bound_on_the_displacement_is_proved() -> None:
+    """Also where it is reached, at the corner of the window: ball arithmetic adds less than the build's margin."""
+    from build_model.calibration import displacement_px as built_px
+    from build_model.window import Window
+
+    rng = np.random.default_rng(0)
+    for kinds in itertools.product([0.0, 1.0], repeat=4):
+        shares = 10 ** rng.uniform(-5, -1.5, 4) * [1, 1, 1, 100] * np.array(kinds)
+        focal_length_m = TOLERANT.camera.focal_length_m * 10 ** rng.uniform(-1, 1)
+        camera, calibration = replace(TOLERANT.camera, focal_length_m=focal_length_m), Calibration(*shares.tolist())
+        scene = replace(TOLERANT, camera=camera, calibration=calibration)
+        bound, stated = displacement_px(scene, Window(10, 60, 5, 100)), built_px(scene, Window(10, 60, 5, 100))
+        assert bound <= stated <= 1.1 * bound
 
 
 def test_a_cells_claim_is_refuted_where_its_entry_is(model: Model) -> None:

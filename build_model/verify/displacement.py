@@ -38,7 +38,7 @@ def displacement_px(scene: Scene, window: Window) -> float:
         bottom = window.bottom + reach * (window.bottom == height)
         across = [(side - arb(camera.u0)) / focal for side in _parts(left, right)]
         down = [(side - arb(camera.v0)) / focal for side in _parts(top, bottom)]
-        yaw, roll = (arb(0, angle).sin_cos() for angle in (off.yaw_rad, off.roll_rad))
+        yaw, roll = _sine_and_cosine(off.yaw_rad), _sine_and_cosine(off.roll_rad)
         largest = arb(0)
         for a, b in itertools.product(across, down):
             depth = a * yaw[0] + yaw[1]
@@ -54,6 +54,12 @@ def displacement_px(scene: Scene, window: Window) -> float:
             for ray, shift in ((a, shift_a), (b, shift_b)):
                 largest = largest.max(abs(focal * (shift + share * (ray + shift)) + arb(0, off.principal_px)).upper())
         return float(np.nextafter(float(largest.upper()), np.inf))
+
+
+def _sine_and_cosine(largest_rad: float) -> tuple[arb, arb]:
+    """Balls of the sine and the cosine of every angle within plus or minus `largest_rad`, which is below pi/2."""
+    sine, cosine = arb(largest_rad).sin_cos()
+    return arb(0, sine.upper()), cosine.union(arb(1))
 
 
 def _parts(low: int, high: int) -> list[arb]:
