@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from build_model.assumptions import assumptions
 from runtime import terminal
+from runtime.assumptions import assumptions
 from runtime.errors import INTERRUPTED, fail
 
 if TYPE_CHECKING:

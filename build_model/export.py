@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper
 
 from build_model.assembly import assemble
-from build_model.assumptions import assumptions
 from build_model.calibration import check_calibration
 from build_model.filter_graph import GraphWriter, filter_graph
 from build_model.filter_tables import FilterTables
@@ -37,6 +36,7 @@ from build_model.paper.paper_bound import PaperBound, paper_bound
 from build_model.partition import partition
 from build_model.state_network import TrainingReport, state_graph, train_state_network
 from build_model.user_network import bare, user_network
+from runtime.assumptions import assumptions
 from runtime.model.format import FORMAT_VERSION, IR_VERSION, METADATA_KEY, NETWORK_OUTPUT, NETWORK_PREFIX, OPSET, metadata_digest
 from runtime.rounding import OUTWARD_PX
 from runtime.scene import Scene

@@ -11,7 +11,9 @@ from runtime.estimate import Box, Estimate, FrameError, Outcome
 from runtime.estimator import Estimator
 from runtime.frames import EventError, FrameStream, events_to_frames
 from runtime.model.format import ModelError
+from runtime.motion import Motion
 from runtime.scene import Scene, SceneError
+from runtime.tracker import Tracker
 
 __all__ = [
     "Box",
@@ -21,8 +23,10 @@ __all__ = [
     "FrameError",
     "FrameStream",
     "ModelError",
+    "Motion",
     "Outcome",
     "Scene",
     "SceneError",
+    "Tracker",
     "events_to_frames",
 ]

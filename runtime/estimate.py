@@ -8,6 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from runtime.scene import STATE_NAMES
+
 
 class FrameError(ValueError):
     """A frame that the model cannot take."""
@@ -21,11 +23,23 @@ class FrameError(ValueError):
         return FrameError, (self.actual, self.expected)  # not the message alone, of which an exception is copied otherwise
 
 
+def axis_number(name: str, key: str) -> int:
+    """The number of a state's axis by its name. Raises ValueError, which names `key`, for another name."""
+    if name not in STATE_NAMES:
+        raise ValueError(f"{key}: no axis is called {name!r}; give some of {', '.join(STATE_NAMES)}")
+    return STATE_NAMES.index(name)
+
+
 class Outcome(enum.Enum):
-    """What a frame says: CERTIFIED, a box is given; NO_RUNWAY, no state of the domain is consistent with it."""
+    """What a frame says.
+
+    CERTIFIED: a box is given. NO_RUNWAY: no state of the domain is consistent with the frame. INCONSISTENT: some state is, but none is
+    consistent with what else is known too, so that one of the assumptions is broken: domain, calibration, motion, prior or budget.
+    """
 
     CERTIFIED = "certified"
     NO_RUNWAY = "no runway"
+    INCONSISTENT = "inconsistent"
 
 
 @dataclass(frozen=True)
@@ -55,6 +69,17 @@ class Box:
     def half_widths(self) -> NDArray[np.float64]:
         """Half of the box's extent, (4,)."""
         return (self.upper - self.lower) / 2
+
+    def replace(self, **intervals: tuple[float, float]) -> Box:
+        """The box with other intervals on the named axes: `box.replace(theta=(0.49, 0.51))`, in rad and m.
+
+        Raises ValueError for an axis of another name, and for bounds that are not finite and ordered.
+        """
+        lower, upper = self.lower.copy(), self.upper.copy()
+        for name, (low, high) in intervals.items():
+            axis = axis_number(name, "box")
+            lower[axis], upper[axis] = low, high
+        return Box(lower, upper)
 
     def contains(self, state: ArrayLike) -> bool:
         """True if a state (4,) lies in the box, borders included; False if it has a NaN."""
@@ -87,6 +112,8 @@ class Estimate:
     """Connected parts of what is consistent, each in its box; more than one is an ambiguity. One without refinement."""
     touches_boundary: bool
     """The box reaches a face of the domain: it holds the state only if the aircraft is in the domain."""
+    assumed: tuple[str, ...]
+    """What the certificate rests on, in words: the model's assumptions, and what else was taken to be known."""
 
     @property
     def certified(self) -> bool:

@@ -4,7 +4,8 @@
 
 Xi-hat is the hull of the bank entries that pass, contracted to what the frame can tell. By Theorem A it contains the aircraft's state
 whatever the clutter, if the state lies in the scene's domain, the camera is the scene's (no roll or yaw, the calibration as stated, up to
-the tolerance), and at most `missed_budget` pixels of the runway's image are dark (up to the tolerance).
+the tolerance), and at most `missed_budget` pixels of the runway's image are dark (up to the tolerance). By Theorem C the same holds of what
+is left of the entries within a box that is known to hold the state.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from runtime.assumptions import assumptions, prior_assumption
 from runtime.estimate import Box, Estimate, FrameError, Outcome
 from runtime.model.entries import Entries
 from runtime.model.format import BOX_TENSORS, MASK_TENSORS, OUTPUTS, ModelError
@@ -26,6 +29,7 @@ from runtime.model.model_file import ModelFile, packaged_model, parse_model, rea
 from runtime.model.session import check_interface, open_session, reason_of
 from runtime.refine.refiner import Refiner
 from runtime.refine.regions import hulls, regions_of
+from runtime.refine.slices import covering, within
 from runtime.refine.theorem_b import refined_by_cell
 from runtime.refine.witnesses import witnesses
 from runtime.scene import STATE_NAMES, Scene, SceneError
@@ -33,6 +37,21 @@ from runtime.state_set import StateSet
 
 REFINED_BEYOND_PX = 2
 """How far beyond the spatial masks the refinement looks at pixels; those farther out it takes for lit."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """What the model says of one frame: its outputs (models/README.md), and the frame itself."""
+
+    pixels: NDArray[np.uint8]
+    cell: int
+    support: NDArray[np.int32]
+    mismatch: NDArray[np.int32]
+    passes: NDArray[np.bool_]
+    cell_lower: NDArray[np.float32]
+    cell_upper: NDArray[np.float32]
+    filtered: NDArray[np.uint8]
+    network_state: NDArray[np.float64]
 
 
 class Estimator:
@@ -51,10 +70,12 @@ class Estimator:
             raise ModelError(f"{name}: its metadata misstate the smallest |K| of its entries; export it again with export-model")
         self._session = open_session(model.content, name, threads)
         check_interface(self._session, self.scene, model.tensors["must_light_size"].shape, name)
-        self._domain = Box(self.scene.domain.lower, self.scene.domain.upper)
-        self._fixed = self._domain.lower == self._domain.upper
+        self.domain = Box(self.scene.domain.lower, self.scene.domain.upper)
+        self._fixed = self.domain.lower == self.domain.upper
         window = self._entries.window_and_beyond(REFINED_BEYOND_PX)
         self._refiner = Refiner(self.scene, int(self._budgets["missed_budget"]), int(self._budgets["extra_budget"]), window)
+        budgets = {name: int(budget) for name, budget in self._budgets.items()}
+        self.assumed = tuple(assumptions(replace(self.scene, tolerance=replace(self.scene.tolerance, **budgets))))
         # The file's absolute path: whoever reads it again may do so after a change of folder.
         budgets = {"missed_budget": missed_budget, "extra_budget": extra_budget}
         self._arguments = {"path": os.path.abspath(name), **budgets, "sha256": self.sha256}
@@ -116,37 +137,84 @@ class Estimator:
         except Exception as error:  # onnxruntime raises classes of its own that share only this one
             raise ModelError(f"{self._name}: onnxruntime cannot run it ({reason_of(error)}); export it again") from error
 
-    def estimate(self, frame: NDArray, proposal: ArrayLike | None = None, refine: bool = True) -> Estimate:
+    def estimate(self, frame: NDArray, proposal: ArrayLike | None = None, refine: bool = True, prior: Box | None = None) -> Estimate:
         """State and certified box of one frame.
 
         `frame`: (height, width), bool, or uint8 of {0, 1}. `proposal`: a state (4,) from elsewhere to be checked in place of NN_e's.
-        `refine`: contract the passing entries to what the frame can tell (`runtime.refine`); without it, the box is their hull. Raises
-        `FrameError` for any other frame and ValueError for a proposal of another shape.
+        `refine`: contract the passing entries to what the frame can tell (`runtime.refine`); without it, the box is their hull. `prior`: a
+        box that is known to hold the state (Theorem C); if it contradicts a frame which has a state without it, the outcome is
+        INCONSISTENT. Raises `FrameError` for any other frame and ValueError for a proposal of another shape.
         """
+        state = None if proposal is None else self._checked_proposal(proposal)
+        found = self.find(frame)
+        if prior is None:
+            return self.concluded(found, self._regions(found, refine), self.assumed, proposal=state)
+        left = self.left_of(found, self.covering(prior), refine)
+        parts = None if refine else [np.arange(len(left))]
+        regions = regions_of(left, self.domain, parts) if len(left) else ()
+        otherwise = Outcome.INCONSISTENT if not regions and self._regions(found, refine) else Outcome.NO_RUNWAY
+        return self.concluded(found, regions, (*self.assumed, prior_assumption(prior.lower, prior.upper)), otherwise, state)
+
+    def find(self, frame: NDArray) -> Found:
+        """What the model says of a frame. Raises `FrameError` as `estimate` does."""
         pixels = self._checked_frame(frame)
-        outputs = self.run_unchecked(pixels)
-        cell, support, mismatch, passes, cell_lower, cell_upper, filtered, network_state = outputs.values()
-        network = np.where(self._fixed, self._domain.lower, network_state)
-        passing = np.flatnonzero(support)
-        if refine and len(passing):
-            regions = regions_of(self._refined(pixels.view(np.bool_), passes), self._domain)
-        else:
-            regions = hulls(cell_lower[passing], cell_upper[passing], [np.arange(len(passing))] if len(passing) else [], self._domain)
+        cell, support, mismatch, passes, lower, upper, filtered, network_state = self.run_unchecked(pixels).values()
+        network = np.where(self._fixed, self.domain.lower, network_state)
+        return Found(pixels, int(cell), support, mismatch, passes, lower, upper, filtered, network)
+
+    def covering(self, prior: Box) -> StateSet:
+        """The part of a box that lies in the domain, as a set of states; no set where there is none."""
+        low, high = np.maximum(prior.lower, self.domain.lower), np.minimum(prior.upper, self.domain.upper)
+        if (low > high).any():
+            return self._entries.all[:0]
+        return covering(self.scene.camera, Box(low, high), self.scene.camera.v0)
+
+    def left_of(self, found: Found, known: StateSet | None = None, refine: bool = True) -> StateSet:
+        """Sets that hold every state which is consistent with the frame and, by Theorem C, lies in one of the `known` sets."""
+
+        cut = None if known is None else partial(within, self.scene.camera, known=known)
+        frame, line_px = found.pixels.view(np.bool_), self.scene.tolerance.line_px
+        if refine and self._refiner.extra_budget >= 0 and line_px == 0:  # Theorem B's claims are made at tolerance 0 only
+            return refined_by_cell(self._refiner, self._entries, found.passes, frame, cut)
+        entries = self._entries.sets(found.passes)
+        entries = entries if cut is None else cut(entries)
+        if not refine or len(entries) == 0:
+            return entries
+        return self._refiner.refine(witnesses(frame, line_px), entries, narrowed=cut is not None)
+
+    def concluded(
+        self,
+        found: Found,
+        regions: tuple[Box, ...],
+        assumed: tuple[str, ...],
+        otherwise: Outcome = Outcome.NO_RUNWAY,
+        proposal: NDArray[np.float64] | None = None,
+    ) -> Estimate:
+        """The estimate whose box is the hull of `regions`; its outcome is `otherwise` where there are none."""
         box = Box(np.min([part.lower for part in regions], axis=0), np.max([part.upper for part in regions], axis=0)) if regions else None
-        state, used_fallback = self._shielded(box, network if proposal is None else self._checked_proposal(proposal))
+        state, used_fallback = self._shielded(box, found.network_state if proposal is None else proposal)
         return Estimate(
-            outcome=Outcome.NO_RUNWAY if box is None else Outcome.CERTIFIED,
+            outcome=otherwise if box is None else Outcome.CERTIFIED,
             box=box,
             state=state,
             used_fallback=used_fallback,
-            network_state=network,
-            cell=int(cell),
-            passing=passing,
-            mismatch=int(mismatch[cell]),
-            filtered=filtered,
+            network_state=found.network_state,
+            cell=found.cell,
+            passing=np.flatnonzero(found.support),
+            mismatch=int(found.mismatch[found.cell]),
+            filtered=found.filtered,
             regions=regions,
             touches_boundary=box is not None and self._touches_boundary(box),
+            assumed=assumed,
         )
+
+    def _regions(self, found: Found, refine: bool) -> tuple[Box, ...]:
+        """What is consistent with the frame alone, as boxes."""
+        passing = np.flatnonzero(found.support)
+        if refine and len(passing):
+            return regions_of(self.left_of(found), self.domain)
+        cells = [np.arange(len(passing))] if len(passing) else []
+        return hulls(found.cell_lower[passing], found.cell_upper[passing], cells, self.domain)
 
     def entries_within(self, frame: NDArray, missed_budget: int) -> StateSet:
         """The bank's entries of whose pixels K at most so many are dark: at another budget than the model's, no certificate of anything.
@@ -176,13 +244,6 @@ class Estimator:
         """S of a cell, (height, width): every pixel that one of its states can light, widened by the tolerance."""
         return self._entries.within(cell, np.ones(self.scene.camera.shape, dtype=np.bool_))
 
-    def _refined(self, frame: NDArray[np.bool_], passes: NDArray[np.bool_]) -> StateSet:
-        """What is left of the passing entries. Theorem B's claims are made at tolerance 0 only."""
-        line_px = self.scene.tolerance.line_px
-        if self._refiner.extra_budget >= 0 and line_px == 0:
-            return refined_by_cell(self._refiner, self._entries, passes, frame)
-        return self._refiner.refine(witnesses(frame, line_px), self._entries.sets(passes))
-
     @staticmethod
     def _shielded(box: Box | None, proposal: NDArray[np.float64]) -> tuple[NDArray[np.float64] | None, bool]:
         """The paper's Eq. (8): the proposal if it lies in the box, else the box's centre; and whether the centre was taken."""
@@ -191,7 +252,7 @@ class Estimator:
         return (proposal, False) if box.contains(proposal) else (box.centre, True)
 
     def _touches_boundary(self, box: Box) -> bool:
-        touches = (box.lower <= self._domain.lower) | (box.upper >= self._domain.upper)
+        touches = (box.lower <= self.domain.lower) | (box.upper >= self.domain.upper)
         return bool((touches & ~self._fixed).any())
 
     def _checked_frame(self, frame: NDArray) -> NDArray[np.uint8]:

@@ -43,6 +43,8 @@ MARGIN_PX = 2.0**-20
 ROUNDED_SHARE_OF_COLUMN, ROUNDED_SHARE_OF_DISTANCE = 2.0**-51, 2.0**-52
 """What float64 loses at most: on a column, of |u - u0| |v - v0| over the row's distance from the horizon, as the scale there is rounded
 (four units in the last place of 1); and on a distance, of the largest coordinate along the runway (two sums)."""
+INSTANTS = {"start": 0.0, "middle": 0.5, "end": 1.0}
+"""Instants of a window of events, and the share of it that lies before them."""
 MOST_ITEMS = 2**12
 """Markings, and cells along an axis, that are read: a tenth of a second's work."""
 LONGEST_FOUND = 200
@@ -267,6 +269,40 @@ class Tolerance:
 
 
 @dataclass(frozen=True)
+class MotionBounds:
+    """How fast the state can change between two frames: for each axis the least and the largest rate, per second."""
+
+    theta_rad_s: tuple[float, float]
+    x_m_s: tuple[float, float]
+    y_m_s: tuple[float, float]
+    z_m_s: tuple[float, float]
+
+    def __post_init__(self) -> None:
+        for field, (low, high) in zip(dataclasses.fields(self), self.rates, strict=True):
+            _demand(low <= high, f"motion.{field.name}", [low, high], "give the least and the largest rate, in that order")
+
+    @property
+    def rates(self) -> tuple[tuple[float, float], ...]:
+        """Least and largest rate of theta, x, y and z."""
+        return self.theta_rad_s, self.x_m_s, self.y_m_s, self.z_m_s
+
+
+@dataclass(frozen=True)
+class EventWindow:
+    """The instant of a window of events that a certificate speaks of: at it, no more than the budget of the runway's pixels are dark."""
+
+    instant: str = "middle"
+
+    def __post_init__(self) -> None:
+        _demand(self.instant in INSTANTS, "window.instant", self.instant, f"give one of {', '.join(INSTANTS)}")
+
+    @property
+    def share(self) -> float:
+        """The share of the window that lies before the instant."""
+        return INSTANTS[self.instant]
+
+
+@dataclass(frozen=True)
 class EstimatorTraining:
     """How NN_e is trained (`build_model.state_network`): frames made by the supercover, with clutter and missed pixels."""
 
@@ -293,6 +329,8 @@ class Scene:
     calibration: Calibration = Calibration()
     tolerance: Tolerance = Tolerance()
     estimator: EstimatorTraining = EstimatorTraining()
+    motion: MotionBounds | None = None
+    window: EventWindow | None = None
 
     def __post_init__(self) -> None:
         low, high = self.domain.lower, self.domain.upper
@@ -349,6 +387,11 @@ class Scene:
     def to_dict(self) -> dict[str, Any]:
         """The scene as plain tables; `Scene.from_dict` gives it back."""
         return _plain(dataclasses.asdict(self))
+
+    @property
+    def instant_share(self) -> float:
+        """The share of a window of events that lies before the instant which a certificate speaks of; by default half of it."""
+        return (self.window or EventWindow()).share
 
 
 def _plain(value: Any) -> Any:

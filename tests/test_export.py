@@ -18,12 +18,12 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 from scenes import OFF_BY, ONE_CELL, PAPER, SCENES
 
-from build_model.assumptions import assumptions
 from build_model.export import export_model
 from build_model.paper.paper_bound import paper_bound
 from build_model.partition import partition
 from build_model.user_network import EstimatorError, user_network
 from runtime import Estimator
+from runtime.assumptions import assumptions
 from runtime.image import runway_image
 from runtime.model.format import METADATA_KEY
 from runtime.rounding import OUTWARD_PX

@@ -18,12 +18,12 @@ EXTRAS = (
 )
 """Import names of what the embedded runtime must do without."""
 SHARED_WITH_VERIFIER = {
-    "build_model.assumptions",  # words
     "build_model.filter_graph",  # the writer of the graph that the file's tables demand
     "build_model.filter_tables",  # what the graph is made of
     "build_model.partition",  # what a list of cells is; the verifier makes its own
     "build_model.window",
     "runtime",
+    "runtime.assumptions",  # words
     "runtime.errors",
     "runtime.model",
     "runtime.model.format",

@@ -29,7 +29,6 @@ import numpy as np
 import onnx
 from google.protobuf.message import DecodeError
 
-from build_model.assumptions import assumptions
 from build_model.filter_tables import FilterTables
 from build_model.partition import Partition
 from build_model.verify.box_claims import check_boxes, demand_of_all
@@ -39,6 +38,7 @@ from build_model.verify.counterexample import Counterexample, Refuted, demand
 from build_model.verify.displacement import displacement_px
 from build_model.verify.model_graph import check_graph, read_tables
 from build_model.verify.outputs import check_outputs
+from runtime.assumptions import assumptions
 from runtime.errors import one_line
 from runtime.model.format import METADATA_KEY, PADDING_SIZE, ModelError
 from runtime.model.model_file import parse_model

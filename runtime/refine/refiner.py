@@ -64,6 +64,8 @@ FACES = 6
 NONE_MISSED = Search(first=4, theta=4, z=2, scale=1, pieces=2, rounds=8, gain=0.02)
 SOME_MISSED = Search(first=4, theta=3, z=2, scale=2, pieces=4, rounds=20, gain=0.02)
 """Missed pixels are counted where windows are a pixel or two wide (`missed`): then smaller pieces pay, cut along the scale too."""
+NARROWED = Search(first=4, theta=3, z=2, scale=2, pieces=4, rounds=20, gain=0.002)
+"""Pixels may be missed, and the entries were cut to a prior: they are few, so that there is time for small gains."""
 LARGEST_START = 512
 """More passing entries than this say that the frame tells next to nothing: they are left as they are, at a bounded cost."""
 LARGEST_ROUND = 2**18
@@ -82,16 +84,17 @@ class Refiner:
     window: tuple[slice, slice] = (slice(None), slice(None))
     """Rows and columns outside of which pixels count as lit, whatever the frame shows there."""
 
-    def refine(self, frame: Bits, entries: StateSet, claimed: Bits | None = None) -> StateSet:
+    def refine(self, frame: Bits, entries: StateSet, claimed: Bits | None = None, narrowed: bool = False) -> StateSet:
         """Slices that hold all states of `entries` which are consistent with `frame`, (height, width); none if there is none.
 
         `frame` is dilated by the tolerance. `claimed`: the lit pixels of S, for Theorem B at tolerance 0; the entries are of one cell then.
+        `narrowed`: the entries were cut to what is known besides the frame.
         """
         if len(entries) > LARGEST_START:
             return entries
         witnesses = LitPixels.of(frame, self.window, beyond=True)
         claims = None if claimed is None else Claims(LitPixels.of(claimed, self.window, beyond=False), self.extra_budget)
-        search = NONE_MISSED if self.missed_budget == 0 else SOME_MISSED
+        search = NONE_MISSED if self.missed_budget == 0 else NARROWED if narrowed else SOME_MISSED
         most_sets = LARGEST_ROUND // (len(self.scene.runway.markings) * len(witnesses.canvas))
         slices = min(max(most_sets // max(len(entries), 1), 1), search.first)
         a_face = min(max(most_sets // (FACES * search.theta * search.z * search.scale), 1), search.pieces)

@@ -14,9 +14,9 @@ MOST_TO_JOIN = 1024
 """More pieces than this are taken for one connected part, whose hull is the same, at a bounded cost."""
 
 
-def regions_of(pieces: StateSet, domain: Box) -> tuple[Box, ...]:
-    """The boxes of the connected parts of the pieces, none of which may be empty, within the domain."""
-    return hulls(pieces.lower, pieces.upper, connected_parts(pieces), domain)
+def regions_of(pieces: StateSet, domain: Box, parts: Sequence[NDArray[np.int64]] | None = None) -> tuple[Box, ...]:
+    """The boxes of parts of the pieces, none of which may be empty, within the domain; by default of the connected parts."""
+    return hulls(pieces.lower, pieces.upper, connected_parts(pieces) if parts is None else parts, domain)
 
 
 def hulls(lower: NDArray, upper: NDArray, parts: Sequence[NDArray[np.int64]], domain: Box) -> tuple[Box, ...]:

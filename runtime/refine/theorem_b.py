@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,11 +12,23 @@ from runtime.refine.refiner import Refiner, joined
 from runtime.state_set import StateSet
 
 
-def refined_by_cell(refiner: Refiner, entries: Entries, passes: NDArray[np.bool_], frame: NDArray[np.bool_]) -> StateSet:
+def refined_by_cell(
+    refiner: Refiner,
+    entries: Entries,
+    passes: NDArray[np.bool_],
+    frame: NDArray[np.bool_],
+    known: Callable[[StateSet], StateSet] | None,
+) -> StateSet:
     """What is left of the entries that pass, (rows, width), if the lit pixels of the true cell's S are the runway's, all but e of them.
 
     `frame`: (height, width). It is its own witness: these claims are made at tolerance 0 only. e is the refiner's `extra_budget`.
+    `known` cuts a cell's entries to what is known besides the frame.
     """
-    cells = np.unique(entries.row_cell[passes.any(axis=1)])
     alone = entries.row_cell[:, None]
-    return joined(*(refiner.refine(frame, entries.sets(passes & (alone == cell)), entries.within(int(cell), frame)) for cell in cells))
+    left = [entries.all[:0]]
+    for cell in np.unique(entries.row_cell[passes.any(axis=1)]):
+        sets = entries.sets(passes & (alone == cell))
+        sets = sets if known is None else known(sets)
+        if len(sets):
+            left.append(refiner.refine(frame, sets, entries.within(int(cell), frame), known is not None))
+    return joined(*left)

@@ -1,8 +1,10 @@
-"""What a model's certificates take for granted, in words."""
+"""What certificates take for granted, in words."""
 
 from __future__ import annotations
 
-from runtime.scene import Scene
+from collections.abc import Iterable
+
+from runtime.scene import STATE_NAMES, STATE_UNITS, Scene
 
 
 def assumptions(scene: Scene) -> list[str]:
@@ -17,3 +19,16 @@ def assumptions(scene: Scene) -> list[str]:
     if tolerance.extra_budget >= 0:
         lines.append(f"At most {tolerance.extra_budget} lit pixels of the true cell's spatial mask are not the runway's{near}.")
     return lines
+
+
+def bounds_text(lower: Iterable[float], upper: Iterable[float]) -> str:
+    """An interval a state axis, with units; an axis that is a number as one."""
+    axes = zip(STATE_NAMES, STATE_UNITS, lower, upper, strict=True)
+    return ", ".join(
+        f"{name} {low:.6g} {unit}" if low == high else f"{name} {low:.6g} to {high:.6g} {unit}" for name, unit, low, high in axes
+    )
+
+
+def prior_assumption(lower: Iterable[float], upper: Iterable[float]) -> str:
+    """What a certificate within a prior takes for granted besides (Theorem C)."""
+    return f"A prior: the state lies in {bounds_text(lower, upper)}."

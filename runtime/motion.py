@@ -1,0 +1,137 @@
+"""How far the aircraft can have moved between two instants, and where that takes a set of states (docs/guarantee.md, Theorem D).
+
+    xi(t1) lies in B + D  if xi(t0) lies in B and the displacement in D;   D = (t1 - t0) [rate_lower, rate_upper] for bounded rates
+
+The scale g at the reference row moves with pitch and altitude. With psi the angle of that row below the horizon,
+
+    g' = g  sin(psi + delta)/sin(psi)  y/(y + epsilon)      for theta + delta, y + epsilon
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.estimate import Box, axis_number
+from runtime.refine.altitude import contract_by_altitude
+from runtime.refine.slices import rereferenced, tangent_below_horizon
+from runtime.rounding import lowered, raised
+from runtime.scene import Camera, Scene
+from runtime.state_set import StateSet
+
+Floats = NDArray[np.float64]
+
+US_PER_S = 1e6
+PEAK_RAD = 1e-9
+"""How near to straight down an angle counts as there: far above float64's error, and sound to either side."""
+
+
+@dataclass(frozen=True)
+class Displacement:
+    """Bounds on how far a state has moved, (4,) each; infinite where nothing is known."""
+
+    lower: Floats
+    upper: Floats
+
+    def __add__(self, other: Displacement) -> Displacement:
+        """First the one, then the other: bounds rounded outward."""
+        return Displacement(*moved_box(self.lower, self.upper, other))
+
+    def replaced(self, intervals: Mapping[str, tuple[float, float]]) -> Displacement:
+        """Other bounds on the named axes. Raises ValueError for an axis of another name, and for bounds that are not ordered numbers."""
+        lower, upper = self.lower.copy(), self.upper.copy()
+        for name, (low, high) in intervals.items():
+            axis = axis_number(name, "displacement")
+            if not low <= high:
+                raise ValueError(f"displacement: found {low} to {high} for {name}; give two ordered numbers")
+            lower[axis], upper[axis] = low, high
+        return Displacement(lower, upper)
+
+
+STANDSTILL = Displacement(np.zeros(4), np.zeros(4))
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Bounds on the rates of theta, x, y and z, (4,) each, in rad and m per second; they may be infinite, where nothing is known."""
+
+    rate_lower: Floats
+    rate_upper: Floats
+
+    def __post_init__(self) -> None:
+        for name in ("rate_lower", "rate_upper"):
+            object.__setattr__(self, name, np.array(getattr(self, name), dtype=np.float64))
+        if self.rate_lower.shape != (4,) or self.rate_upper.shape != (4,) or not (self.rate_lower <= self.rate_upper).all():
+            raise ValueError(f"motion: found rates {self.rate_lower} to {self.rate_upper}; give four ordered pairs of numbers")
+
+    @staticmethod
+    def of(scene: Scene) -> Motion | None:
+        """The scene's [motion]; None if it has none."""
+        return None if scene.motion is None else Motion(*np.transpose(scene.motion.rates))
+
+    def over(self, elapsed_us: float) -> Displacement:
+        """How far the state moves in a time, which may be negative: back to what was before."""
+        if elapsed_us == 0:
+            return STANDSTILL
+        sides = np.stack([self.rate_lower, self.rate_upper]) * (elapsed_us / US_PER_S)
+        low, high = sides.min(axis=0), sides.max(axis=0)
+        return Displacement(lowered(low, np.abs(low)), raised(high, np.abs(high)))
+
+    def __str__(self) -> str:
+        names = ("theta {} to {} rad/s", "x {} to {} m/s", "y {} to {} m/s", "z {} to {} m/s")
+        pairs = zip(names, self.rate_lower.tolist(), self.rate_upper.tolist(), strict=True)
+        return ", ".join(name.format(f"{low:g}", f"{high:g}") for name, low, high in pairs)
+
+
+def moved_box(lower: Floats, upper: Floats, by: Displacement) -> tuple[Floats, Floats]:
+    """Where states between `lower` and `upper`, (..., 4), can have moved to: bounds of the same shape, rounded outward."""
+    low, high = lower + by.lower, upper + by.upper
+    return lowered(low, np.abs(lower) + np.abs(by.lower)), raised(high, np.abs(upper) + np.abs(by.upper))
+
+
+def moved(camera: Camera, sets: StateSet, by: Displacement, domain: Box) -> StateSet:
+    """Sets that hold every state of the domain to which a state of `sets` can have moved; those that hold none are left out."""
+    low, high = moved_box(sets.lower, sets.upper, by)
+    low, high = np.maximum(low, domain.lower), np.minimum(high, domain.upper)
+    inside = np.all(low <= high, axis=1)
+    sets, low, high = sets[inside], low[inside], high[inside]
+    if len(sets) == 0:
+        return sets
+    lowest = min(float(sets.theta[:, 0].min()), float(low[:, 0].min()))
+    sets = rereferenced(sets, np.array([tangent_below_horizon(camera, tangent, lowest) for tangent in sets.tangent]))
+    theta, x, y, z = (np.stack([low[:, axis], high[:, axis]], axis=-1) for axis in range(4))
+    after = StateSet(theta, x, y, z, _moved_scale(sets, theta, y, by), sets.tangent)
+    after = contract_by_altitude(camera, after)
+    return after[~after.empty]
+
+
+def _moved_scale(sets: StateSet, theta: Floats, y: Floats, by: Displacement) -> Floats:
+    """The scales of sets whose pitch and altitude have moved into `theta` and `y`, (sets, 2) each, rounded outward.
+
+    The turn sin(psi + delta)/sin(psi) = cos(delta) + sin(delta) cot(psi) is monotone in psi, and concave in delta where it is above 0: its
+    extremes are at the corners, or, as the largest, 1/sin(psi) where psi + delta = pi/2. And y/(y + epsilon) = 1 - epsilon/y'.
+    """
+    delta = _differences(sets.theta, theta, by.lower[0], by.upper[0])[:, None, :]
+    cosine, sine = sets.turn
+    cotangent = ((cosine - sets.tangent[:, None] * sine) / sets.reference_fall)[:, :, None]
+    turns, terms = np.cos(delta) + np.sin(delta) * cotangent, 1 + np.abs(np.sin(delta) * cotangent) * sets.condition[:, None, None]
+    slow, fast = lowered(turns, terms).min(axis=(1, 2)), raised(turns, terms).max(axis=(1, 2))
+    psi = np.arctan(sets.tangent)[:, None] + sets.theta
+    peaks = (psi + delta[..., 0] <= np.pi / 2 + PEAK_RAD) & (np.pi / 2 - PEAK_RAD <= psi + delta[..., 1])
+    peak = np.where(peaks, np.sqrt(1 + sets.tangent**2)[:, None] / sets.reference_fall, 0).max(axis=1)
+    fast = np.maximum(fast, raised(peak, peak * sets.condition))
+    falls = _differences(sets.y, y, by.lower[2], by.upper[2])[:, None, :] / y[:, :, None]
+    shrinks, terms = 1 - falls, 1 + np.abs(falls)
+    low = sets.scale[:, 0] * np.maximum(slow, 0) * np.maximum(lowered(shrinks, terms).min(axis=(1, 2)), 0)
+    high = sets.scale[:, 1] * fast * raised(shrinks, terms).max(axis=(1, 2))
+    return np.stack([lowered(low, low), raised(high, high)], axis=-1)
+
+
+def _differences(before: Floats, after: Floats, low: float, high: float) -> Floats:
+    """How much a coordinate can have changed, (sets, 2), between `low` and `high`, from an interval into another, (sets, 2) each."""
+    least, most = after[:, 0] - before[:, 1], after[:, 1] - before[:, 0]
+    terms = np.abs(before).max(axis=1) + np.abs(after).max(axis=1)
+    return np.stack([np.maximum(low, lowered(least, terms)), np.minimum(high, raised(most, terms))], axis=-1)

@@ -1,0 +1,139 @@
+"""What is known besides the frame, as sets of states: a prior, and slices of theta on which several sources meet.
+
+Pitch and altitude compensate each other in an image, so that a box around what one frame leaves forgets most of what the frame said. On
+thin slices of theta the intervals of scale, y and z are narrow: a union of sets is passed on as the hulls of its slices. Sources that are
+cut into the same slices, with scales at the same row, meet slice by slice (docs/guarantee.md, Theorems C and D).
+
+Guarantee: every function here keeps each state that its claim speaks of; bounds are rounded outward (`runtime.rounding`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.estimate import Box
+from runtime.model.limits import BELOW_HORIZON_PX
+from runtime.refine.altitude import contract_by_altitude
+from runtime.rounding import OUTWARD_RELATIVE, lowered, raised
+from runtime.scene import Camera
+from runtime.state_set import StateSet, scale_range, scale_ratio, tangent_of_row
+
+Floats = NDArray[np.float64]
+
+SLICES = 32
+"""Slices of theta that a union of sets is passed on in."""
+INTERVALS = ("theta", "x", "y", "z", "scale")
+
+
+def covering(camera: Camera, box: Box, row: float) -> StateSet:
+    """One set that holds all states of the box; the row its scale refers to is `row`, or lower where that is too near the horizon."""
+    theta, x, y, z = (np.array([[low, high]]) for low, high in zip(box.lower, box.upper, strict=True))
+    tangent = np.array([tangent_below_horizon(camera, float(tangent_of_row(camera, row)), box.lower[0])])
+    low, high = scale_range(camera, theta, y, tangent)
+    scale = np.stack([low * (1 - OUTWARD_RELATIVE), high * (1 + OUTWARD_RELATIVE)], axis=-1)
+    return StateSet(theta, x, y, z, scale, tangent)
+
+
+def tangent_below_horizon(camera: Camera, tangent: float, theta_low: float) -> float:
+    """The tangent of a row, or of a lower one that is `BELOW_HORIZON_PX` below the horizon of every theta from `theta_low` on."""
+    return max(tangent, BELOW_HORIZON_PX / camera.focal_px - float(np.tan(theta_low)))
+
+
+def rereferenced(sets: StateSet, tangent: Floats) -> StateSet:
+    """The sets with their scales at other rows, (sets,), which must lie below the horizon of all their states."""
+    low, high = (side[0] for side in scale_ratio(sets, tangent[None]))
+    rounded = (1 + np.abs(tangent)) / sets.reference_fall.min(axis=1)
+    slow, fast = sets.scale.T
+    scale = lowered(slow * low, slow * (rounded + low * sets.condition)), raised(fast * high, fast * (rounded + high * sets.condition))
+    return replace(sets, scale=np.stack(scale, axis=-1), tangent=tangent)
+
+
+def within(camera: Camera, sets: StateSet, known: StateSet) -> StateSet:
+    """For each of the sets the hull of what it has in common with the `known` ones; those that have nothing are left out."""
+    meets = np.ones((len(sets), len(known)), dtype=bool)
+    for name in ("theta", "x", "y", "z"):
+        own, other = getattr(sets, name), getattr(known, name)
+        meets &= (own[:, None, 0] <= other[None, :, 1]) & (other[None, :, 0] <= own[:, None, 1])
+    mine, theirs = np.nonzero(meets)
+    own, other = sets[mine], known[theirs]
+    theta = _common(own.theta, other.theta)
+    other = rereferenced(replace(other, theta=theta), own.tangent)
+    both = replace(own, **{name: _common(getattr(own, name), getattr(other, name)) for name in INTERVALS})
+    hulls = _hulls(contract_by_altitude(camera, both), mine, len(sets), sets.tangent)
+    return hulls[~hulls.empty]
+
+
+def slice_edges(theta: Floats) -> Floats:
+    """Borders of `SLICES` equal slices from the smallest to the largest of `theta`, (sets, 2); of one where that is a single angle."""
+    low, high = float(theta[:, 0].min()), float(theta[:, 1].max())
+    edges = low + (high - low) * (np.arange(SLICES + 1) / SLICES) if high > low else np.array([low, high])
+    edges[-1] = high
+    return edges
+
+
+def sliced(camera: Camera, sets: StateSet, edges: Floats, tangent: float) -> StateSet:
+    """The hull of what each slice, between neighbours of `edges`, holds of the union of `sets`; an inverted set where that is nothing.
+
+    All scales refer to one row: that of `tangent`, or a lower one where the states need it (`tangent_below_horizon`). Slices are closed;
+    what lies outside of the edges is left out.
+    """
+    count = len(edges) - 1
+    tangent = tangent_below_horizon(camera, tangent, float(edges[0]))
+    meets = (sets.theta[:, :1] <= edges[1:]) & (edges[:-1] <= sets.theta[:, 1:])
+    which, place = np.nonzero(meets)
+    parts = sets[which]
+    sides = np.stack([edges[place], edges[place + 1]], axis=-1)
+    parts = replace(parts, theta=_common(parts.theta, sides))
+    parts = contract_by_altitude(camera, rereferenced(parts, np.full(len(parts), tangent)))
+    return _hulls(parts, place, count, np.full(count, tangent))
+
+
+def all_but(sources: Sequence[StateSet], start: StateSet, outliers: int) -> list[StateSet]:
+    """For q = 0 to `outliers`: slices that hold every state of `start` which lies in all but q of the sources, at most.
+
+    Sources and `start` are cut into the same slices with scales at the same row. One source after the other is met: what all but q of
+    the first k hold is what the k-th holds of what all but q of those before hold, or what all but q - 1 of those hold. Hulls are taken
+    on the way: a union of boxes is passed on as the box around it (q-relaxed intersection; sound, and the hull where q = 0).
+    """
+    held = [_bounds(start)] * (outliers + 1)
+    for source in sources:
+        low, high = _bounds(source)
+        met = [_nothing_where_inverted(np.maximum(below, low), np.minimum(above, high)) for below, above in held]
+        held = [met[0]] + [(np.minimum(met[q][0], held[q - 1][0]), np.maximum(met[q][1], held[q - 1][1])) for q in range(1, outliers + 1)]
+    return [_of_bounds(low, high, start.tangent) for low, high in held]
+
+
+def _common(first: Floats, second: Floats) -> Floats:
+    """What two intervals (sets, 2) have in common; inverted if nothing."""
+    return np.stack([np.maximum(first[:, 0], second[:, 0]), np.minimum(first[:, 1], second[:, 1])], axis=-1)
+
+
+def _hulls(parts: StateSet, place: NDArray[np.int64], count: int, tangent: Floats) -> StateSet:
+    """`count` sets: the hull of the parts at each place, wholly inverted where all are empty. Parts of one place share its tangent."""
+    left = ~parts.empty
+    low, high = np.full((count, len(INTERVALS)), np.inf), np.full((count, len(INTERVALS)), -np.inf)
+    below, above = _bounds(parts[left])
+    np.minimum.at(low, place[left], below)
+    np.maximum.at(high, place[left], above)
+    return _of_bounds(low, high, tangent)
+
+
+def _bounds(sets: StateSet) -> tuple[Floats, Floats]:
+    """Lower and upper bounds of all intervals, (sets, 5) each."""
+    bounds = np.stack([getattr(sets, name) for name in INTERVALS], axis=1)
+    return bounds[..., 0], bounds[..., 1]
+
+
+def _of_bounds(low: Floats, high: Floats, tangent: Floats) -> StateSet:
+    theta, x, y, z, scale = np.stack([low, high], axis=-1).swapaxes(0, 1)
+    return StateSet(theta, x, y, z, scale, tangent)
+
+
+def _nothing_where_inverted(low: Floats, high: Floats) -> tuple[Floats, Floats]:
+    """The same boxes, (sets, 5) bounds each; wholly inverted where one interval is, so that hulls with others ignore them."""
+    empty = (low > high).any(axis=1, keepdims=True)
+    return np.where(empty, np.inf, low), np.where(empty, -np.inf, high)
