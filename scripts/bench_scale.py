@@ -17,21 +17,25 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
-import cv2
 import numpy as np
 import typer
+from matplotlib.ticker import NullLocator
 from numpy.typing import NDArray
 from rich.table import Table
 
 from build_model.export import export_model
 from runtime import Estimator, Scene, terminal
 from runtime.recordings.bench import cluttered_frames, machine
-from runtime.recordings.draw import png
+from runtime.recordings.chart import BLUE, FONT_PT, INK, PALE, RED, new_figure, picture_of, rgb, style_axes
+from runtime.recordings.draw import Picture, png
 from runtime.scene import Axis, Bank, Domain, EstimatorTraining
 from runtime.whole_file import write_whole
 
 CLUTTER = 0.02
 QUICK = EstimatorTraining(training_frames=256, epochs=1)
+HEIGHT_IN, WIDTH_PX = 3.8, 1280
+FAMILIES = {"finer": ("the same domain, finer cells", BLUE), "larger": ("cells of 0.1, a larger domain", RED)}
+"""What the chart calls each family, and its colour there."""
 
 
 @dataclass(frozen=True)
@@ -99,33 +103,29 @@ def look_ups(path: Path) -> int:
     return sum(int(np.prod(tensor.dims)) for tensor in onnx.load(path).graph.initializer if tensor.name.startswith("runs_"))
 
 
-def plot(sizes: Sequence[Size]) -> NDArray[np.uint8]:
-    """Milliseconds of `run` against cells, both axes logarithmic: a picture (500, 720, 3)."""
-    picture = np.full((500, 720, 3), 255, dtype=np.uint8)
-    cells, times = np.log([size.cells for size in sizes]), np.log([size.run_ms for size in sizes])
-    low, high = np.floor(times.min() / np.log(2)) * np.log(2), np.ceil(times.max() / np.log(2)) * np.log(2)
+def scale_chart(sizes: Sequence[Size]) -> Picture:
+    """Milliseconds of `run` against cells, both axes logarithmic, a line a family from the first scene on: (height, `WIDTH_PX`, 3)."""
+    figure = new_figure(HEIGHT_IN, WIDTH_PX)
+    axes = figure.subplots()
+    style_axes(axes, INK, PALE)
+    for family, (name, colour) in FAMILIES.items():
+        chosen = [sizes[0], *(size for size in sizes[1:] if size.family == family)]
+        axes.plot([size.cells for size in chosen], [size.run_ms for size in chosen], "o-", color=rgb(colour), label=name)
+    axes.set(xscale="log", yscale="log", xlabel="cells of the domain", ylabel="one run of the model, one thread (ms)")
+    axes.set_xticks(sorted({size.cells for size in sizes}))
+    axes.set_yticks(_powers_of_two([size.run_ms for size in sizes]))
+    for axis in (axes.xaxis, axes.yaxis):
+        axis.set_major_formatter(lambda value, _: f"{value:,.10g}")
+        axis.set_minor_locator(NullLocator())
+    axes.grid(color=rgb(PALE), linewidth=0.5)
+    axes.legend(frameon=False, fontsize=FONT_PT, labelcolor=rgb(INK))
+    return picture_of(figure)
 
-    def point(cell: float, milliseconds: float) -> tuple[int, int]:
-        return int(80 + 560 * (cell - cells[0]) / (cells.max() - cells[0])), int(430 - 370 * (milliseconds - low) / max(high - low, 1e-9))
 
-    def write(text: str, x: int, y: int) -> None:
-        cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (40, 40, 40), 1, cv2.LINE_AA)
-
-    for level in np.arange(low, high + 0.01, np.log(2)):
-        y = point(cells[0], level)[1]
-        cv2.line(picture, (80, y), (640, y), (220, 220, 220), 1)
-        write(f"{np.exp(level):.2g} ms", 15, y + 5)
-    for number, (family, colour) in enumerate((("finer", (170, 110, 40)), ("larger", (40, 40, 200)))):
-        chosen = [0, *(index for index, size in enumerate(sizes) if index and size.family == family)]
-        points = [point(cells[index], times[index]) for index in chosen]
-        cv2.polylines(picture, [np.array(points)], False, colour, 2, cv2.LINE_AA)
-        for index, place in zip(chosen, points, strict=True):
-            cv2.circle(picture, place, 5, colour, -1, cv2.LINE_AA)
-            write(f"{sizes[index].cells}", place[0] - 15, 455)
-        write({"finer": "the same domain, finer cells", "larger": "cells of 0.1, a larger domain"}[family], 110, 40 + 20 * number)
-        cv2.rectangle(picture, (85, 30 + 20 * number), (100, 40 + 20 * number), colour, -1)
-    write("cells; time of one run of the model, one thread", 230, 485)
-    return picture
+def _powers_of_two(values: Sequence[float]) -> list[float]:
+    """The powers of two from the one below the smallest value to the one above the largest."""
+    low, high = np.floor(np.log2(min(values))), np.ceil(np.log2(max(values)))
+    return np.exp2(np.arange(low, high + 1)).tolist()
 
 
 def table(sizes: Sequence[Size]) -> Table:
@@ -171,7 +171,7 @@ def main(
     writer.writerow(Size.__dataclass_fields__)
     writer.writerows(vars(size).values() for size in sizes)
     write_whole(output / "scale.csv", text.getvalue().encode())
-    write_whole(output / "scale.png", png(plot(sizes)))
+    write_whole(output / "scale.png", png(scale_chart(sizes)))
 
 
 if __name__ == "__main__":

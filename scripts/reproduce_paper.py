@@ -36,7 +36,8 @@ from runtime import Estimate, Estimator, ModelError, Scene, terminal
 from runtime.camera import project
 from runtime.errors import fail
 from runtime.image import runway_image
-from runtime.recordings.draw import FILTERED, LINE_HEIGHT, STATE, History, Moment, Picture, colour_pixels, draw_history, draw_runway, png
+from runtime.recordings.draw import FILTERED, LINE_HEIGHT, STATE, Picture, colour_pixels, draw_runway, png
+from runtime.recordings.history import History, Moment, draw_history
 from runtime.whole_file import write_whole
 
 PAPER_MINUTES_A_CELL, PAPER_SECONDS_A_FRAME, PAPER_ERRORS, PAPER_FRAMES = 20, 37, (0.0777, 0.045), 1320

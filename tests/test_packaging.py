@@ -18,7 +18,8 @@ ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 TOP_LEVEL = {
     *("pyproject.toml", "build_model", "runtime", "models", "tests", "scripts"),
-    *("README.md", "LICENSE", "CHANGELOG.md", "Makefile", "constraints.txt", "docs", ".gitignore", ".ci"),
+    *("README.md", "LICENSE", "CHANGELOG.md", "CONTRIBUTING.md", "Makefile", "constraints.txt", "docs"),
+    *(".gitignore", ".pre-commit-config.yaml", ".ci"),
 }
 
 
@@ -52,7 +53,8 @@ def test_constraints_pin_every_direct_dependency_to_a_public_release() -> None:
     lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
     pins = [line for line in lines if line and not line.startswith("#")]
     assert [pin for pin in pins if not re.fullmatch(r"[A-Za-z0-9._-]+==[0-9][0-9a-z.]*", pin)] == []
-    wanted = set(PROJECT["dependencies"]).union(*(PROJECT["optional-dependencies"][extra] for extra in ("build", "recordings", "dev")))
+    extras = ("build", "pictures", "recordings", "dev")
+    wanted = set(PROJECT["dependencies"]).union(*(PROJECT["optional-dependencies"][extra] for extra in extras))
     assert requirement_names(list(wanted)) - {PROJECT["name"]} <= {pin.partition("==")[0] for pin in pins}
     assert "torch==2.13.0" in pins
 

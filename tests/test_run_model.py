@@ -27,7 +27,7 @@ from runtime.explanation import missed_pixels
 from runtime.frames import FrameStream
 from runtime.image import runway_image
 from runtime.recordings.cli import run_model
-from runtime.recordings.draw import MOST_MOMENTS, History, Moment, draw_history
+from runtime.recordings.history import MOST_MOMENTS, History, Moment, draw_history
 from runtime.recordings.recording import EVENT
 from runtime.recordings.report import COLUMNS, TRUTH_COLUMNS
 from runtime.recordings.truth import Truth, TruthError

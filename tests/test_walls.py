@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 ROOTS = (ROOT, ROOT / "scripts")
 EXTRAS = (
     *("torch", "onnx", "onnxscript", "typer", "rich", "flint", "joblib", "faery", "cv2", "h5py", "hdf5plugin", "lz4", "zstandard"),
-    *("dask", "distributed"),
+    *("matplotlib", "dask", "distributed"),
 )
 """Import names of what the embedded runtime must do without."""
 SHARED_WITH_VERIFIER = {

@@ -179,33 +179,3 @@ def as_csv(header: Mapping[str, str], rows: Sequence[Latency]) -> str:
     writer.writerow(Latency.__dataclass_fields__)
     writer.writerows([f"{value:.4f}" if isinstance(value, float) else value for value in vars(row).values()] for row in rows)
     return text.getvalue()
-
-
-def chart(header: Mapping[str, str], rows: Sequence[Latency]) -> NDArray[np.uint8]:
-    """Bars of the medians on a logarithmic scale, with a mark at p99: a picture (height, width, 3)."""
-    left, right, top, line = 330, 140, 60, 22
-    kinds = list(dict.fromkeys(row.frames for row in rows))
-    height = top + line * (len(rows) + 2 * len(kinds)) + 20
-    picture = np.full((height, 1100, 3), 255, dtype=np.uint8)
-    low, high = np.log10(min(row.p50_ms for row in rows) / 2), np.log10(max(row.p99_ms for row in rows) * 1.2)
-
-    def across(milliseconds: float) -> int:
-        return int(left + (np.log10(milliseconds) - low) / (high - low) * (picture.shape[1] - left - right))
-
-    def write(text: str, x: int, y: int, size: float = 0.45) -> None:
-        cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, (40, 40, 40), 1, cv2.LINE_AA)
-
-    write("milliseconds a frame: bar p50, mark p99; log scale", 20, 25, 0.55)
-    write(", ".join(f"{name} {value}" for name, value in header.items()), 20, 47, 0.38)
-    y = top
-    for kind in kinds:
-        y += 2 * line
-        write(kind, 20, y - line // 2, 0.5)
-        for row in (row for row in rows if row.frames == kind):
-            ours = row.method.startswith(("session", "estimate"))
-            cv2.rectangle(picture, (left, y - 6), (across(row.p50_ms), y + 8), (170, 110, 40) if ours else (160, 160, 160), -1)
-            cv2.line(picture, (across(row.p99_ms), y - 8), (across(row.p99_ms), y + 10), (40, 40, 200), 2)
-            write(row.method, 40, y + 5)
-            write(f"{row.p50_ms:.3f} ms", picture.shape[1] - right + 20, y + 5)
-            y += line
-    return picture

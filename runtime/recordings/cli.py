@@ -33,12 +33,12 @@ try:
         Latency,
         as_csv,
         benchmark,
-        chart,
         cluttered_frames,
         machine,
         throughput,
     )
     from runtime.recordings.draw import png
+    from runtime.recordings.latency_chart import latency_chart
     from runtime.recordings.noted import lines_of, noted_of
     from runtime.recordings.recording import Notes, RecordingError, read_events
     from runtime.recordings.report import Report
@@ -234,7 +234,7 @@ def bench_model(
             console.print(_rates(refine, *throughput(estimator, seen, frames * rounds, refine)), highlight=False)
         files = OutputFolder(output)
         files.write("bench.csv", as_csv(header, rows).encode())
-        files.write("bench.png", png(chart(header, rows)))
+        files.write("bench.png", png(latency_chart(header, rows)))
         files.replace()
     except (ModelError, EventError, RecordingError, OutputError, OSError) as error:
         fail(error)

@@ -11,8 +11,6 @@
 | red pixels | dark ones of the true state's runway, or of the nearest state's where the truth is not known |
 | white line and circles | the markings of the true state and their ends, where it is known |
 
-`draw_history` shows states against time in the same colours.
-
 Pictures illustrate; the certificate is the box's numbers.
 """
 
@@ -20,7 +18,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -41,8 +39,6 @@ MASK, MASK_TEXT, FILTERED, BOX, STATE, TRUTH = (140, 60, 20), (230, 140, 70), (9
 CERTIFIED, NO_RUNWAY, NEAREST = (90, 215, 70), (80, 80, 255), (255, 230, 90)
 PIXELS = np.array([BACKGROUND, MASK, FRAME, FILTERED, NO_RUNWAY], dtype=np.uint8)
 """Colours of pixels: dark, dark in S, lit, lit and filtered, dark in the runway."""
-BAND = (0, 85, 130)
-"""Amber as it looks over the background."""
 BOX_LIGHT = 0.16
 """Share of its colour that the box adds to what lies under it: blue stays blue, dark turns amber."""
 SAMPLES = 5
@@ -51,9 +47,6 @@ FRACTION_BITS = 4
 """Lines are placed to a 16th of a picture's pixel."""
 END_RADIUS = 4
 """A circle marks each end of a marking, px of the picture; the truth's shows around an estimate that covers its line."""
-MOST_MOMENTS = 2048
-"""Moments that a history keeps: more than a picture has columns."""
-HISTORY_WIDTH, PANEL_HEIGHT, PANEL_LEFT, PANEL_GAP = 1280, 200, 150, 14
 NARROWEST_PICTURE = 560
 """Width that the text needs, px; narrower frames are magnified."""
 LINE_HEIGHT = 24
@@ -136,96 +129,6 @@ def draw_runway(
     picture[LINE_HEIGHT : LINE_HEIGHT + panel.shape[0], : panel.shape[1]] = panel
     _write(picture, 0, [(title, TEXT), _outcome(estimate), (_cells(scene, estimate), TEXT)])
     return picture
-
-
-@dataclass(frozen=True)
-class Moment:
-    """What is known of the time from `start_us` to `stop_us`: estimate, certified bounds and truth, (4,) each or None."""
-
-    start_us: float
-    stop_us: float
-    state: NDArray[np.float64] | None
-    lower: NDArray[np.float64] | None
-    upper: NDArray[np.float64] | None
-    truth: NDArray[np.float64] | None
-
-    def joined(self, later: Moment) -> Moment:
-        """Both as one: the hull of their bounds, the later states; uncertified only if neither is certified."""
-        bounds = [(moment.lower, moment.upper) for moment in (self, later) if moment.lower is not None and moment.upper is not None]
-        lower = np.min([low for low, _ in bounds], axis=0) if bounds else None
-        upper = np.max([high for _, high in bounds], axis=0) if bounds else None
-        state, truth = (old if new is None else new for old, new in ((self.state, later.state), (self.truth, later.truth)))
-        return Moment(self.start_us, later.stop_us, state, lower, upper, truth)
-
-
-class History:
-    """Moments one after the other, in constant memory: when there are too many, neighbours are joined.
-
-    Each begins where the one before it ends, whatever its time: after a break of the camera's clock the picture goes on.
-    """
-
-    def __init__(self) -> None:
-        self.moments: list[Moment] = []
-        self._every = 1
-        self._count = 0
-
-    def add(self, moment: Moment) -> None:
-        """Takes the next moment."""
-        if self.moments:
-            start_us = self.moments[-1].stop_us
-            moment = replace(moment, start_us=start_us, stop_us=start_us + moment.stop_us - moment.start_us)
-        if self._count % self._every:
-            self.moments[-1] = self.moments[-1].joined(moment)
-        else:
-            self.moments.append(moment)
-        self._count += 1
-        if len(self.moments) == MOST_MOMENTS and self._count % self._every == 0:
-            self.moments = [even.joined(odd) for even, odd in zip(self.moments[::2], self.moments[1::2], strict=True)]
-            self._every *= 2
-
-
-def draw_history(scene: Scene, history: History, width: int = HISTORY_WIDTH) -> Picture:
-    """State against time: a panel for each free axis of the domain, whose range it spans.
-
-    Amber: the certified band. Magenta: the estimate. White: the truth. Red, below: nothing is certified. Returns (height, width, 3).
-    """
-    free = [axis for axis in range(4) if scene.domain.upper[axis] > scene.domain.lower[axis]]
-    moments = history.moments or [Moment(0, 1, None, None, None, None)]
-    picture = _canvas(len(free) * (PANEL_HEIGHT + PANEL_GAP) + 2 * LINE_HEIGHT, width)
-    seconds = moments[0].start_us / 1e6, moments[-1].stop_us / 1e6
-    _write(picture, 0, [("certified band", BOX), ("estimate", STATE), ("truth", TRUTH), ("no runway", NO_RUNWAY)])
-    for place, axis in enumerate(free):
-        top = LINE_HEIGHT + place * (PANEL_HEIGHT + PANEL_GAP)
-        _draw_panel(picture[top : top + PANEL_HEIGHT], moments, axis, scene.domain.lower[axis], scene.domain.upper[axis])
-    _write(picture[-LINE_HEIGHT:], 0, [("", TEXT), (f"{seconds[0]:.2f} s to {seconds[1]:.2f} s", TEXT)])
-    return picture
-
-
-def _draw_panel(panel: Picture, moments: Sequence[Moment], axis: int, low: float, high: float) -> None:
-    """One axis of the state over [low, high], with a fifth of that above and below."""
-    first, last, right_end = moments[0].start_us, moments[-1].stop_us, panel.shape[1] - 1
-    margin = (high - low) / 5
-
-    def column(time_us: float) -> int:
-        return PANEL_LEFT + int((time_us - first) / (last - first) * (right_end - PANEL_LEFT))
-
-    def row(value: float) -> int:
-        return int(np.clip((high + margin - value) / (high - low + 2 * margin), 0, 1) * (PANEL_HEIGHT - 1))
-
-    for value in (low, high):
-        cv2.line(panel, (PANEL_LEFT, row(value)), (right_end, row(value)), FRAME_BORDER, 1)
-        text = f"{STATE_NAMES[axis]} {value:.2f} {STATE_UNITS[axis]}"
-        cv2.putText(panel, text, (8, row(value) + 5), cv2.FONT_HERSHEY_SIMPLEX, 0.45, TEXT, 1, cv2.LINE_AA)
-    for moment in moments:
-        left, right = column(moment.start_us), column(moment.stop_us)
-        if moment.lower is None or moment.upper is None:
-            cv2.rectangle(panel, (left, PANEL_HEIGHT - 8), (right, PANEL_HEIGHT - 1), NO_RUNWAY, cv2.FILLED)
-        else:
-            cv2.rectangle(panel, (left, row(moment.upper[axis])), (right, row(moment.lower[axis])), BAND, cv2.FILLED)
-    for kind, colour in (("truth", TRUTH), ("state", STATE)):
-        known = [(column((m.start_us + m.stop_us) / 2), row(getattr(m, kind)[axis])) for m in moments if getattr(m, kind) is not None]
-        if known:
-            cv2.polylines(panel, [np.array(known, dtype=np.int32)], False, colour, 1, cv2.LINE_AA)
 
 
 def png(picture: Picture) -> bytes:

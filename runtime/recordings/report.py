@@ -5,7 +5,7 @@
 | estimates.csv | a line a window: see `COLUMNS` |
 | summary.json | counts, means, why nothing was certified, the model's digest and assumptions, names of the other files |
 | overlay.mp4, overlay_<window>.png | `runtime.recordings.draw.draw_estimate` |
-| state.png | `runtime.recordings.draw.draw_history`: state against time with the certified band |
+| state.png | `runtime.recordings.history.draw_history`: state against time with the certified band |
 
 All files get their names together when the report is closed, also after an interruption; those of an earlier report that have no new
 one are removed. With a truth, every window is judged: whether Theorem A's assumptions hold for it, and whether the certified box has the
@@ -29,7 +29,8 @@ from numpy.typing import NDArray
 from runtime.estimate import Estimate
 from runtime.estimator import Estimator
 from runtime.explanation import Explanation, explain
-from runtime.recordings.draw import History, Moment, Picture, draw_estimate, draw_history, png
+from runtime.recordings.draw import Picture, draw_estimate, png
+from runtime.recordings.history import History, Moment, draw_history
 from runtime.recordings.tally import Tally
 from runtime.recordings.truth import Judgement, Truth, judge
 from runtime.recordings.video import WIDTH, Video
