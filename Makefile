@@ -6,6 +6,7 @@
 PYTHON ?= python3
 PIP_EXTRA ?=
 BIN := .venv/bin
+PICTURES := .venv/pictures
 INSTALLED := .venv/installed
 LOWEST := .venv-lowest/bin
 LOWEST_INSTALLED := .venv-lowest/installed
@@ -16,9 +17,15 @@ SOURCES := $(shell find build_model runtime -name "*.py")
 
 setup: $(INSTALLED)
 
-$(INSTALLED): pyproject.toml constraints.txt
+# The runtime and what draws: seconds, and enough for the committed model.
+$(PICTURES): pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet $(PIP_EXTRA) --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet $(PIP_EXTRA) --constraint constraints.txt --editable '.[pictures]'
+	touch $@
+
+# The rest: what builds models, torch among it, and what tests.
+$(INSTALLED): $(PICTURES)
+	$(BIN)/python -m pip install $(PIP_EXTRA) --constraint constraints.txt --editable '.[dev]'
 	touch $@
 
 # A second environment with the lowest versions that pyproject.toml admits, each with the newest of what it needs itself.
@@ -44,8 +51,11 @@ lint: $(INSTALLED)
 types: $(INSTALLED)
 	$(BIN)/pyright
 
-demo: out/paper.onnx
-	$(BIN)/python scripts/fly_approach.py --model $<
+demo: $(PICTURES)
+	$(BIN)/python scripts/fly_approach.py --model models/paper.onnx --out out/approach
+	@echo "Pictures of the committed model are in out/approach. Now the same model is built here: torch is installed, and a network trained."
+	@$(MAKE) --no-print-directory out/paper.onnx
+	$(BIN)/python scripts/fly_approach.py --model out/paper.onnx --out out/approach_built
 
 out/paper.onnx: models/paper.toml constraints.txt $(SOURCES) | $(INSTALLED)
 	mkdir -p $(@D)

@@ -4,8 +4,9 @@
 
 The aircraft descends from the far and high end of the domain to the near and low one while its pitch swings. Every frame is
 `I_r(xi) or I_n`: no pixel of the runway fails and the camera is the scene's, so that Theorem A promises a certified box with the
-truth inside, whatever the clutter. Prints a row a frame and a summary; writes approach.csv, pictures and a contact sheet. Exit code 1
-if a frame breaks the promise, 2 if something given cannot be used.
+truth inside, whatever the clutter. Prints a row a frame and a summary; writes approach.csv, state.png (state against time), pictures and a
+contact sheet. Exit code 1 if a frame breaks the promise, 2 if something given cannot be used. Needs the extra `pictures` alone, and the
+extra `recordings` where the clutter is a recording in a format that numpy does not read.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ from rich.progress import track
 from rich.table import Table
 from rich.text import Text
 
-from build_model.spatial_filter import spatial_filters
 from runtime import Estimate, Estimator, ModelError, Scene, terminal
 from runtime.errors import fail
 from runtime.frames import FrameStream
 from runtime.image import runway_image
 from runtime.recordings.draw import contact_sheet, draw_estimate, draw_runway, png
+from runtime.recordings.history import History, Moment, draw_history
 from runtime.recordings.recording import RecordingError, read_events
 from runtime.scene import STATE_COLUMNS, STATE_NAMES, STATE_UNITS
 from runtime.whole_file import write_whole
@@ -163,29 +164,36 @@ def csv_text(steps: Sequence[Step], lit_shares: Sequence[float]) -> str:
     return text.getvalue()
 
 
+def moment_of(step: Step) -> Moment:
+    """The step as a window of `WINDOW_US`, each after the one before."""
+    start_us, box = step.number * WINDOW_US, step.estimate.box
+    return Moment(start_us, start_us + WINDOW_US, step.estimate.state, box and box.lower, box and box.upper, step.truth)
+
+
 def run(model: Path | None, frames: int, clutter: str, out: Path, seed: int, console: Console) -> bool:
     """Flies, prints and writes; True if every certificate was kept. Raises `ModelError`, `RecordingError`, OSError."""
     estimator = Estimator.load(model, extra_budget=-1)
     scene, rng = estimator.scene, np.random.default_rng(seed)
     states = approach_states(scene, frames, rng.uniform(0, 2 * np.pi))
     noise = clutter_frames(clutter, scene.camera.shape, frames, rng, console)
-    masks = spatial_filters(scene)
     pictured = set(np.linspace(0, frames - 1, min(PICTURES, frames)).round().astype(int).tolist())
-    steps, lit_shares, small = [], [], []
+    steps, lit_shares, small, history = [], [], [], History()
     for step in track(fly(estimator, states, noise), "flying", total=frames, console=console, transient=True):
         lit_shares.append(float(step.frame.mean()))
         if step.number in pictured:
-            shown = {"mask": masks[step.estimate.cell], "truth": step.truth, "title": f"frame {step.number}"}
+            shown = {"mask": estimator.spatial_mask(step.estimate.cell), "truth": step.truth, "title": f"frame {step.number}"}
             write_whole(out / f"overlay_{len(small)}.png", png(draw_estimate(scene, step.frame, step.estimate, **shown)))
             small.append(draw_runway(scene, step.frame, step.estimate, **shown))
+        history.add(moment_of(step))
         # An approach may be long: its frames are not kept.
         nothing = np.empty((0, 0), dtype=np.uint8)
         steps.append(replace(step, frame=nothing, estimate=replace(step.estimate, filtered=nothing)))
     write_whole(out / "contact_sheet.png", png(contact_sheet(small, columns=5)))
+    write_whole(out / "state.png", png(draw_history(scene, history)))
     write_whole(out / "approach.csv", csv_text(steps, lit_shares).encode())
     console.print(flight_table(scene, steps), summary_table(scene, steps, lit_shares))
     lines = [
-        f"written: {out}/approach.csv, {out}/contact_sheet.png and {len(small)} overlays",
+        f"written: {out}/approach.csv, {out}/state.png, {out}/contact_sheet.png and {len(small)} overlays",
         "assumed:",
         *estimator.metadata["assumptions"],
     ]

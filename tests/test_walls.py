@@ -109,6 +109,16 @@ def test_the_runtime_never_imports_build_model_or_scripts() -> None:
     assert "runtime.scene" in direct_imports("build_model.partition")
 
 
+# --- the demonstration ---
+
+
+def test_the_demonstration_on_the_committed_model_needs_only_what_draws() -> None:
+    drawing = {"typer", "rich", "cv2", "matplotlib"}
+    blocked = ["build_model", *(name for name in EXTRAS if name not in drawing)]
+    loaded = loaded_with("fly_approach", f"sys.modules.update(dict.fromkeys({blocked!r}))\nsys.path.insert(0, 'scripts')")
+    assert drawing <= loaded
+
+
 # --- the verifier ---
 
 
