@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
+
 from runtime import terminal
 from runtime.assumptions import assumptions
 from runtime.errors import INTERRUPTED, fail
+from runtime.scene import STATE_NAMES, STATE_UNITS
 
 if TYPE_CHECKING:
     from types import FrameType
 
+    from numpy.typing import NDArray
     from rich.console import Console
 
     from build_model.export import ExportReport
+    from build_model.paper.paper_bound import PaperBound
     from runtime.scene import Scene
 
 try:
@@ -47,7 +52,7 @@ def export_model(
     console = terminal.console()
     with _interrupts_end_in_a_line(target):
         loaded, report = _export(console, scene, target, estimator=estimator, seed=seed, jobs=jobs, dask=dask)
-    _print_summary(console, loaded, target, report)
+    _print_summary(console, loaded, target, report, _clean_half_widths(target))
 
 
 @contextmanager
@@ -94,6 +99,13 @@ def _export(console: Console, scene: Path, target: Path, **options: Any) -> tupl
         fail(f"{target}: cannot be written ({error.strerror}); the model that was there before is untouched")
 
 
+def _clean_half_widths(target: Path) -> NDArray[np.float64]:
+    from build_model.box_size import clean_half_widths
+    from runtime.estimator import Estimator
+
+    return clean_half_widths(Estimator.load(target))
+
+
 def _progress(console: Console) -> Progress:
     texts = TextColumn("{task.description:<22}"), TextColumn("{task.fields[loss]}")
     return Progress(texts[0], BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), texts[1], console=console)
@@ -112,7 +124,7 @@ class _Bars:
         self.progress.update(self.tasks[stage], completed=done, total=total, loss="" if loss is None else f"loss {loss:.5f}")
 
 
-def _print_summary(console: Console, scene: Scene, target: Path, report: ExportReport) -> None:
+def _print_summary(console: Console, scene: Scene, target: Path, report: ExportReport, half_widths: NDArray[np.float64]) -> None:
     table = Table(title=str(target), show_header=False, title_justify="left")
     rows = {
         "cells": report.cells,
@@ -120,6 +132,7 @@ def _print_summary(console: Console, scene: Scene, target: Path, report: ExportR
         "smallest |K| - m": report.smallest_must_light - scene.tolerance.missed_budget,
         "S, pixels a cell": f"{report.spatial_pixels.min()} to {report.spatial_pixels.max()}",
         "calibration moves the image by": f"{report.displacement_px:.2f} px at most (line_px {scene.tolerance.line_px})",
+        **bound_rows(scene, report.paper_bounds, half_widths),
         **{f"{stage}, seconds": f"{seconds:.1f}" for stage, seconds in report.seconds.items()},
         "file": f"{report.file_bytes / 1e6:.2f} MB",
         "sha256": report.sha256,
@@ -132,6 +145,32 @@ def _print_summary(console: Console, scene: Scene, target: Path, report: ExportR
     console.print("The certificate assumes:")
     for line in assumptions(scene):
         console.print(f"  - {line}", highlight=False)
+
+
+def bound_rows(scene: Scene, bounds: Sequence[PaperBound | None], half_widths: NDArray[np.float64]) -> dict[str, str]:
+    """The paper's bound 4 L_h delta over the cells, and what it is to be compared with: the certified box from corner to corner.
+
+    The paper adds rad and m in one 2-norm; the box's diagonal bounds the same norm of the error of any estimate in the box.
+    """
+    finite = [bound for bound in bounds if bound is not None]
+    paper = "no finite L_h is proved for any cell"
+    if finite:
+        constants = _span([bound.inverse_lipschitz_per_px for bound in finite])
+        extents = _span([bound.zeta_half_extent_px for bound in finite])
+        lacking = f"; none for {len(bounds) - len(finite)} of {len(bounds)} cells" if len(finite) < len(bounds) else ""
+        paper = f"{_span([bound.state_error for bound in finite])} (L_h {constants} per px, delta {extents} px){lacking}"
+    diagonal = np.median(2 * np.linalg.norm(half_widths, axis=1))
+    free = np.flatnonzero(scene.domain.upper > scene.domain.lower)
+    medians = np.median(half_widths, axis=0)
+    return {
+        "the paper's bound, not a certificate": paper,
+        "certified box, corner to corner": f"{diagonal:.4g}, median of {len(half_widths)} frames without clutter",
+        "certified box, half-widths": ", ".join(f"{STATE_NAMES[axis]} {medians[axis]:.4f} {STATE_UNITS[axis]}" for axis in free) or "-",
+    }
+
+
+def _span(values: Sequence[float]) -> str:
+    return f"{min(values):.3g} to {max(values):.3g}"
 
 
 def export_model_command() -> None:

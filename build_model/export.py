@@ -62,6 +62,8 @@ class ExportReport:
     smallest_must_light: int
     spatial_pixels: NDArray[np.int64]
     displacement_px: float
+    paper_bounds: list[PaperBound | None]
+    """Of every cell, as `paper_bounds` gives them."""
     file_bytes: int
     sha256: str
     seconds: dict[str, float]
@@ -118,6 +120,7 @@ def export_model(
         smallest_must_light=tables.smallest_must_light,
         spatial_pixels=np.concatenate([bank.spatial.sizes(1) for bank in banks]),
         displacement_px=shift_px,
+        paper_bounds=bounds,
         file_bytes=len(content),
         sha256=hashlib.sha256(content).hexdigest(),
         seconds=watch.seconds,

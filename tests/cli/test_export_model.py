@@ -8,9 +8,14 @@ import textwrap
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from runtime import Estimator
+from build_model.box_size import clean_half_widths
+from build_model.cli import bound_rows
+from build_model.paper.paper_bound import PaperBound
+from runtime import Estimator, Scene
+from runtime.image import runway_image
 
 COMMAND = "from build_model.cli import export_model_command; export_model_command()"
 Run = Callable[..., subprocess.CompletedProcess]
@@ -95,9 +100,38 @@ def test_a_scene_becomes_a_model_with_a_summary(run: Run, scene_file: Path, tmp_
         assert text in result.stdout
     for text in ("training NN_e", "loss 0.", "frames for NN_e", "The certificate assumes:", "At most 0 pixels of the runway's image"):
         assert text in result.stdout
+    (bound,) = estimator.metadata["paper_bounds"]
+    length, extent = bound["inverse_lipschitz_per_px"], bound["zeta_half_extent_px"]
+    (printed,) = (line for line in result.stdout.splitlines() if "the paper's bound, not a certificate" in line)
+    for value in (4 * length * extent, length, extent):
+        assert f"{value:.3g} to {value:.3g}" in printed
+    (boxes,) = (line for line in result.stdout.splitlines() if "certified box, corner to corner" in line)
+    assert "median of 50 frames without clutter" in boxes
     again = run(scene_file.name, "-o", "again.onnx", "--seed", 3)
     assert again.returncode == 0
     assert (tmp_path / "again.onnx").read_bytes() == model.read_bytes()
+
+
+def test_the_papers_bound_stands_beside_the_boxes_also_where_it_is_lacking(paper_scene: Scene) -> None:
+    half_widths = np.array([[0.3, 0.0, 0.4, 0.0], [0.3, 0.0, 0.4, 0.0], [9.0, 0.0, 9.0, 9.0]])
+    bounds = [PaperBound(2.0, 0.5), None, PaperBound(3.0, 0.25)]
+    rows = bound_rows(paper_scene, bounds, half_widths)
+    assert list(rows.values()) == [
+        "3 to 4 (L_h 0.25 to 0.5 per px, delta 2 to 3 px); none for 1 of 3 cells",
+        "1, median of 3 frames without clutter",
+        "theta 0.3000 rad, y 0.4000 m, z 0.0000 m",
+    ]
+    assert next(iter(bound_rows(paper_scene, [None], half_widths).values())) == "no finite L_h is proved for any cell"
+
+
+def test_clean_boxes_are_those_of_their_own_images(estimator_of: Callable[..., Estimator]) -> None:
+    estimator = estimator_of("one cell")
+    scene = estimator.scene
+    half_widths = clean_half_widths(estimator, 3, seed=5)
+    states = np.random.default_rng(5).uniform(scene.domain.lower, scene.domain.upper, (3, 4))
+    boxes = [estimator.estimate(runway_image(scene, state)).box for state in states]
+    np.testing.assert_array_equal(half_widths, [box.half_widths for box in boxes if box is not None])
+    assert len(half_widths) == 3
 
 
 @pytest.mark.parametrize(
