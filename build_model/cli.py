@@ -59,8 +59,8 @@ def export_model(
 def _interrupts_end_in_a_line(target: Path) -> Iterator[None]:
     """Ends the command with one line and exit code 130 on Ctrl-C, or on a signal that `runtime.terminal` takes for it.
 
-    What ends the block after the signal is taken for its consequence: an import of torch's that it breaks off ends in an error of another
-    class. A signal that is ignored, as in a background job of a shell, stays so.
+    Any exception that ends the block after the signal counts as its consequence: where the signal breaks off an import of torch, that
+    raises an error of another class. A signal that is ignored, as in a background job of a shell, stays so.
     """
     seen = []
 

@@ -147,7 +147,7 @@ def build_banks(scene: Scene, jobs: int = 1, progress: Progress = _silent, dask:
 def paper_bounds(scene: Scene, jobs: int = 1, dask: str | None = None) -> list[PaperBound | None]:
     """The paper's bound of every cell, in the order of the partition, by the workers of `build_banks`. Raises `ClusterError`.
 
-    None for a cell that has none, as one that is a single state.
+    None for a cell without a finite bound, such as one that is a single state.
     """
     cells = partition(scene)
     if (cells.lower == cells.upper).all():

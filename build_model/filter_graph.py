@@ -23,7 +23,7 @@ from runtime.model.format import BUDGETS, FRAME, LINE_BOX_TENSORS
 from runtime.scene import STATE_NAMES, Scene
 
 BIT = np.int8
-"""Weights of a product of bytes; those of the frame are unsigned, and this is the pair that processors have instructions for."""
+"""Type of the weights in a product of bytes: the frame's bytes are unsigned, and for this pair processors have instructions."""
 
 
 class GraphWriter:
@@ -194,7 +194,7 @@ def _extreme(g: GraphWriter, tables: FilterTables, reduction: str, name: str, by
 def _hull(g: GraphWriter, scene: Scene, tables: FilterTables, side: str, cells: NDArray, remove: str, reduction: str) -> None:
     """cell_lower or cell_upper: the extreme over the passing entries, the others moved out of its way by the largest float32.
 
-    The cell's own side where none passes, and on a fixed axis. Each axis by itself, so that what it takes stays in the cache.
+    Where none passes, and on a fixed axis, it is the cell's own side. Each axis is taken by itself, so that its numbers stay in the cache.
     """
     states, sides = getattr(tables, f"state_{side}"), []
     for axis, name in enumerate(STATE_NAMES):

@@ -2,8 +2,8 @@
 
 A mask is a few vertical runs (`build_model.pixel_mask`), and the lit pixels of a run are the sum down to its end less the sum down to
 its start. Equal masks, which neighbouring cells often have, are counted once. Sorting the masks by their number of runs leaves few look-ups
-without use. Where every mask is its own mirror image, as those
-of a runway straight ahead are, the frame is folded along that axis first, and half of the runs remain.
+without use. Where every mask is its own mirror image, as those of a runway straight ahead are, the frame is folded along that axis first,
+and half of the runs remain.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ CONSTANT_VALUES = {"value": None, "value_float": np.float32, "value_floats": np.
 OLDEST_OPSET = 13
 """Oldest operator set of a user's network: since then what decides a shape is an input, but for the axes of reductions."""
 AXES = Attribute(tuple, None, -LARGEST_RANK, LARGEST_RANK - 1)
-"""Of a reduction, in operator sets before 18."""
+"""The attribute `axes` of a reduction, in operator sets before 18."""
 
 
 class EstimatorError(ValueError):
@@ -72,7 +72,7 @@ def _converted(model: onnx.ModelProto) -> onnx.GraphProto:
 
 
 def _check_convertible(node: onnx.NodeProto) -> None:
-    """Raises ValueError for an operator or an attribute that no operator set has so: onnx's converter may end the process there."""
+    """Raises ValueError for an operator, or an attribute's value, that no operator set has: onnx's converter may end the process there."""
     if node.op_type not in OPERATORS:
         raise ValueError(f"found the operator {node.op_type}; static, standard operators only are taken")
     known = {"axes": AXES, **OPERATORS[node.op_type].attributes}
@@ -109,7 +109,7 @@ def _described(value: onnx.ValueInfoProto) -> str:
 
 
 def bare(network: onnx.GraphProto) -> onnx.GraphProto:
-    """The graph without notes of how it came about, which name files of the machine that made it."""
+    """The graph without its metadata, which name files of the machine that made it."""
     bare = onnx.GraphProto()
     bare.CopyFrom(network)
     for part in (bare, *bare.node, *bare.input, *bare.output, *bare.initializer):

@@ -24,17 +24,17 @@ Estimates = Callable[[Frame], Estimate]
 CHUNK = 8
 """Frames that a worker is given at once."""
 _estimate: Estimates
-"""What a process that `by_processes` has started makes of a frame."""
+"""The function by which a process that `by_processes` has started estimates a frame; set when that process starts."""
 
 
 def by_threads(estimate: Estimates, frames: Iterable[Frame], workers: int) -> Iterator[Estimate]:
-    """What `estimate` makes of the frames, on `workers` threads."""
+    """The frames' estimates in their order, made by `estimate` on `workers` threads."""
     with ThreadPoolExecutor(workers) as pool:
         yield from _in_order(frames, workers, lambda chunk: pool.submit(_estimate_each, estimate, chunk))
 
 
 def by_processes(load: Callable[[], Estimates], width: int, frames: Iterable[Frame], workers: int) -> Iterator[Estimate]:
-    """What `load()`, called once in each of `workers` processes, makes of frames of that width. `load` is sent there by pickle."""
+    """The estimates of frames of that width in their order, by `workers` processes; each calls `load()` once, which pickle sends there."""
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(workers, context, initializer=_load, initargs=(load,)) as pool:
         for estimate in _in_order(frames, workers, lambda chunk: pool.submit(_estimate_bits, np.packbits(chunk, axis=-1), width)):
@@ -42,7 +42,7 @@ def by_processes(load: Callable[[], Estimates], width: int, frames: Iterable[Fra
 
 
 def _in_order(frames: Iterable[Frame], workers: int, submit: Callable[[list[Frame]], Future[list[Estimate]]]) -> Iterator[Estimate]:
-    """What the chunks give, in their order; takes at most 2 `workers` + 1 chunks ahead of what it has given."""
+    """The chunks' estimates in the order of the frames. At most 2 `workers` + 1 chunks are taken before the first of them is given out."""
     remaining, started = iter(frames), deque[Future[list[Estimate]]]()
     while chunk := list(itertools.islice(remaining, CHUNK)):
         started.append(submit(chunk))

@@ -93,7 +93,7 @@ class Estimate:
 
     outcome: Outcome
     box: Box | None
-    """Certified; None where nothing is."""
+    """The certified box; None where nothing is certified."""
     state: NDArray[np.float64] | None
     """The proposal if it lies in the box, else the box's centre; None where nothing is certified."""
     used_fallback: bool

@@ -39,11 +39,11 @@ class Shortfall:
     state: Floats
     """(4,), rad and m."""
     pixels: int
-    """Of the runway's image."""
+    """How many pixels the runway's image has."""
     missed: int
-    """Those without a lit pixel within `line_px` in the sup norm."""
+    """How many of them have no lit pixel of the frame within `line_px` in the sup norm."""
     dark_rows: Mapping[str, tuple[int, ...]]
-    """Rows of the frame, counted from 0 at the top, in which a marking has such pixels; of the markings that have some."""
+    """The rows, from 0 at the top, in which a marking has such pixels, by the marking's name; a marking without any is left out."""
 
     def rows_text(self) -> str:
         """For example "L rows 231-236, 240; R row 238"."""
@@ -60,7 +60,7 @@ class Reason(enum.Enum):
 
 @dataclass(frozen=True)
 class Explanation:
-    """Of a frame without a certificate. `nearest` is the best state that was found; nothing is certified of it."""
+    """Why a frame has no certificate. `nearest` is the best state that was found; nothing is certified of it."""
 
     reason: Reason
     nearest: Shortfall
@@ -79,7 +79,7 @@ class Explanation:
 
 
 def shortfall(scene: Scene, frame: NDArray, state: Floats) -> Shortfall:
-    """What a frame (height, width), lit where not 0, lacks of I_r(state), (4,)."""
+    """The shortfall of a frame (height, width), lit where not 0, against the runway's image in the state (4,)."""
     dark = dark_pixels(scene, frame, state)
     rows = {marking.name: tuple(np.flatnonzero(own.any(axis=1)).tolist()) for marking, own in zip(scene.runway.markings, dark, strict=True)}
     pixels, missed = int(np.count_nonzero(runway_image(scene, state))), missed_pixels(scene, frame, state, scene.tolerance.line_px)

@@ -16,14 +16,15 @@ OUTWARD_PX = MARGIN_PX
 """Margin that every bound on a row or a column is widened by, in px."""
 
 ROUNDING_SHARE = 2.0**-46
-"""Share of its terms by which a bound is moved outward where they may be of any size: a hundred times float64's rounding of them all.
+"""Where the terms of a bound may be of any size, the bound is moved outward by this share of them: a hundred times what float64 loses.
 
-The error of a sum or product of a few dozen roundings is at most so many times 2^-53 of its largest terms."""
+A sum or product that is rounded a few dozen times is wrong by at most as many times 2^-53 of its largest terms."""
 
 OUTWARD_RELATIVE = 2.0**-30
 """Share by which a lower bound must exceed an upper one before an interval of angles, altitudes or scales is called empty.
 
-Between -1 and 1 it is taken of 1: a pitch near 0 is the difference of larger angles, and has their error."""
+The share is taken of the upper bound's size, and of 1 where that is smaller: an angle near 0 is the difference of larger ones, and has
+their error."""
 
 
 def below(values_px: ArrayLike) -> NDArray[np.float64]:
@@ -37,12 +38,12 @@ def above(values_px: ArrayLike) -> NDArray[np.float64]:
 
 
 def lowered(values: ArrayLike, terms: ArrayLike) -> NDArray[np.float64]:
-    """Lower bounds on what `values` stand for; `terms` are the sizes of the terms that they are the sum of, or of themselves."""
+    """Lower bounds on the real numbers that `values` are rounded from, each a sum or product of terms of the sizes `terms`."""
     return np.asarray(values) - ROUNDING_SHARE * np.asarray(terms)
 
 
 def raised(values: ArrayLike, terms: ArrayLike) -> NDArray[np.float64]:
-    """Upper bounds on what `values` stand for; `terms` as in `lowered`."""
+    """Upper bounds on the real numbers that `values` are rounded from; `terms` as in `lowered`."""
     return np.asarray(values) + ROUNDING_SHARE * np.asarray(terms)
 
 
@@ -67,7 +68,7 @@ def first_crossed(start_upper_px: ArrayLike) -> NDArray[np.int64]:
 
 
 def last_crossed(stop_lower_px: ArrayLike) -> NDArray[np.int64]:
-    """Largest index of a pixel whose inside a path reaches that goes on to `stop_lower_px` or farther."""
+    """Largest index of a pixel whose inside is reached by every path that goes on to `stop_lower_px` or farther."""
     return np.ceil(below(stop_lower_px)).astype(np.int64) - 1
 
 

@@ -37,7 +37,7 @@ FOCAL_RANGE_PX = (1.0, 1e6)
 LARGEST_PRINCIPAL_POINT_PX = 32768.0
 """Largest distance of the principal point from the frame's corner, per axis: twice the largest frame, for the same reason."""
 LARGEST_LINE_PX = 16
-"""Largest tolerance, px: beyond it a frame of clutter witnesses every line."""
+"""Largest tolerance, px: with a larger one, clutter has a lit pixel near every point, and no frame refutes anything."""
 MARGIN_PX = 2.0**-20
 """What `runtime.rounding` widens every bound on a row or a column by, px; a scene whose own rounding comes near it is refused."""
 ROUNDED_SHARE_OF_COLUMN, ROUNDED_SHARE_OF_DISTANCE = 2.0**-51, 2.0**-52

@@ -56,7 +56,7 @@ class StateSet:
         return np.logical_or.reduce([side[:, 0] > side[:, 1] for side in (self.theta, self.x, self.y, self.z, self.scale)])
 
     def contracted(self, **bounds: tuple[Floats, Floats]) -> StateSet:
-        """The sets with some intervals but theta's intersected with others, each given as lower and upper bounds (sets,)."""
+        """The sets with the named intervals (any but theta's) intersected with the bounds given for them, lower and upper, (sets,) each."""
         closer = {}
         for name, (low, high) in bounds.items():
             own = getattr(self, name)
@@ -64,11 +64,11 @@ class StateSet:
         return self._with(**closer)
 
     def emptied(self, which: NDArray[np.bool_]) -> StateSet:
-        """The sets, some of them empty: their scale is inverted, and above 0."""
+        """The sets, of which those marked in `which` (sets,) are made empty: their scale gets an inverted interval, above 0."""
         return self._with(scale=np.where(which[:, None], [2.0, 1.0], self.scale))
 
     def _with(self, **fields: Floats) -> StateSet:
-        """Other intervals beside the same theta, whose sines and cosines are not taken again."""
+        """The sets with other intervals, theta's excepted, whose sines and cosines are then not computed again."""
         sets = replace(self, **fields)
         for name in ("turn", "reference_fall", "condition"):
             if name in self.__dict__:

@@ -5,7 +5,7 @@ in `run-model ... | head -1`, what is left to print is dropped, the files are wr
 A stdout that fails otherwise, as a file on a full disk, is told on stderr, with exit code 2. A signal to end (SIGTERM, SIGHUP) is taken as
 Ctrl-C.
 
-`console` is rich's, but for names of files: neither `run[/]x` nor `:cat:` is anything but a name. rich and typer come with the extras,
+`console` is rich's, without its markup: a file called `run[/]x` or `:cat:` is printed under its name. rich and typer come with the extras,
 and are imported when they are needed.
 """
 
@@ -28,7 +28,7 @@ WIDTH_OF_A_FILE = 120
 
 
 def console(width_of_a_file: int = WIDTH_OF_A_FILE, *, stderr: bool = False) -> Console:
-    """A console on stdout or stderr, as wide as the terminal, that takes every text as it is."""
+    """A console on stdout or stderr, as wide as the terminal, that prints every text literally."""
     from rich.console import Console
 
     stream = sys.stderr if stderr else sys.stdout

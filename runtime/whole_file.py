@@ -42,7 +42,7 @@ class OutputError(Exception):
 
 @contextlib.contextmanager
 def writing(path: Path) -> Iterator[None]:
-    """Makes an `OutputError` that names `path` of the system's error."""
+    """Turns the system's error within the block into an `OutputError` that names `path`."""
     try:
         yield
     except OSError as error:

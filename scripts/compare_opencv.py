@@ -61,7 +61,7 @@ SLOPE_MARGIN, PLACE_MARGIN_PX = 0.08, 3.0
 SYMMETRY_PX = 3.0
 """How far, px, a pair of segments may differ in the scale of the ground that they show, measured at the outer marking."""
 NEAR_LINE_PX = (2.5, 1.5, 1.2)
-"""Pixels are taken for a line's if their centres lie this near to it, round after round."""
+"""In each round, the pixels whose centres lie this near to a line are taken as its own."""
 LARGEST_GAP = 1
 """Rows without a pixel that a marking may have between its ends."""
 MOST_PAIRS = 12

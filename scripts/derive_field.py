@@ -9,7 +9,7 @@ markings should be where the pixels fire, and line_px no larger than it must be.
 
 1. Markings. A stripe of some width fires along its edges, while its middle, once it is lit all the time, stays dark. Each stripe becomes
    two markings, at a distance from its middle for which they miss the fewest pixels; the ends, in whose last pixel little changes, are
-   drawn in by `END_INSET_M`. The middle alone is tried too.
+   moved inward by `END_INSET_M`. The middle alone is tried too.
 2. Witnesses. On flights of other seeds than the recordings that are judged, missed(t) of every window is the number of pixels of
    I_r(truth) without a lit one within t px in the sup norm.
 3. missed_budget is missed(t) at the given share of the windows, and line_px the smallest t for which a bank can be built whose entries

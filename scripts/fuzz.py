@@ -454,7 +454,7 @@ class Worker:
         other.close()
 
     def run(self, target: str, case: Case) -> tuple[str, str]:
-        """How the case ended, and what is wrong with that or nothing."""
+        """How the case ended, and what is wrong with that; empty if nothing is."""
         self.pipe.send((target, *case))
         if not self.pipe.poll(CASE_SECONDS):
             return self._ended("hung", f"no answer within {CASE_SECONDS} s")

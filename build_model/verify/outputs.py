@@ -69,7 +69,7 @@ def defined_outputs(
 
 
 def _hull(sides: NDArray[np.float32], extreme: Callable[..., NDArray[np.float32]]) -> NDArray[np.float32]:
-    """The extreme of the passing entries' sides, (4,); NaN if there is none."""
+    """The extreme of the passing entries' sides, (4,); NaN where no entry passes."""
     return extreme(sides, axis=0) if len(sides) else np.full(4, np.nan, dtype=np.float32)
 
 

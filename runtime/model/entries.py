@@ -13,8 +13,9 @@ v0 - F tan(theta) the horizon, (theta, x, y, z) a state of the set's box, all nu
    larger than the box allows.
 
 Padding, and entries whose box of states and scale contradict each other by more than float64's error, are in no such set: they have no
-state. That the sets hold all states which the graph's `passes` stands for is the model's claim. `verify-model` proves it, and of the
-file as it is: 2, that boxes are ordered and within the domain up to float32's rounding, and scales above 0 and within a step of 3.
+state. That the sets hold all states which the graph's `passes` stands for is the model's claim, and `verify-model` proves it. Of the
+numbers in the file it also proves statement 2, that boxes are ordered and lie in the domain up to float32's rounding, and that scales are
+above 0 and exceed the range of statement 3 by no more than a step of their bins.
 """
 
 from __future__ import annotations
@@ -121,7 +122,7 @@ def _state_sets(scene: Scene, tensors: dict[str, NDArray[Any]], places: NDArray[
     _check_reference_rows(scene, row, theta, name)
     scale = np.stack([tensors[f"line_{side}"].reshape(-1, 4)[places, 2] for side in SIDES], axis=-1)
     sets = StateSet(theta, x, y, z, scale, tangent_of_row(scene.camera, row))
-    return replace(sets, scale=_scales_drawn_in(scene, sets, name))
+    return replace(sets, scale=_contracted_scales(scene, sets, name))
 
 
 def _check_states(scene: Scene, states: NDArray[np.float32], name: str) -> None:
@@ -148,10 +149,11 @@ def _check_reference_rows(scene: Scene, rows: NDArray[np.float64], theta: NDArra
             raise ModelError(f"{name}: an entry's reference_row is {rows[wrong][0]:.6g}, {limits}; export it again with export-model")
 
 
-def _scales_drawn_in(scene: Scene, sets: StateSet, name: str) -> NDArray[np.float64]:
-    """The scales of the sets, (sets, 2), within what theta, y and the reference row allow; inverted where they contradict each other.
+def _contracted_scales(scene: Scene, sets: StateSet, name: str) -> NDArray[np.float64]:
+    """The sets' scales, (sets, 2), contracted to what theta, y and the reference row allow; inverted where they contradict each other.
 
-    The file's may reach beyond that by a step of the scale's bins. Raises `ModelError` if they reach farther, or are not ordered above 0.
+    The file's scales may exceed that range by a step of their bins. Raises `ModelError` if they exceed it by more, or are not ordered
+    above 0.
     """
     low, high = scale_range(scene.camera, sets.theta, sets.y, sets.tangent)
     step = largest_steps(scene, sets.x)

@@ -13,14 +13,14 @@ from runtime.scene import STATE_NAMES
 
 FORMAT_VERSION = 1
 METADATA_KEY = "glideproof"
-"""Of the ONNX file's metadata_props: JSON with the scene, the digests and what else a user must know."""
+"""Key among the ONNX file's metadata_props; its value is JSON with the scene, the digests and what else a user must know."""
 OPSET = 20
 """Version of the standard operators that export-model writes and the runtime takes."""
 IR_VERSION = 10
 
 FRAME = "frame"
 BUDGETS = ("missed_budget", "extra_budget")
-"""Initialisers that are inputs too, with the scene's values."""
+"""Initialisers that are inputs too; their defaults are the scene's values."""
 NETWORK_OUTPUT = "network_state"
 OUTPUTS = ("cell", "support", "mismatch", "passes", "cell_lower", "cell_upper", "filtered", NETWORK_OUTPUT)
 NETWORK_PREFIX = "state_network/"

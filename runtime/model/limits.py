@@ -14,7 +14,7 @@ SCALE_STEP = 2.0**-10
 SMALLEST_LEVER_M = 1e-3
 """A marking's distance from the camera's vertical plane counts as at least this when the bins of the scale are sized."""
 ROWS_BELOW_FRAME = 1
-"""How far below the frame a reference row may lie: where the horizon of some state is the frame's last row, it must."""
+"""How far below the frame a reference row may lie: it must, where some state has its horizon in the frame's last row."""
 
 
 def largest_steps(scene: Scene, x: NDArray[np.float64]) -> NDArray[np.float64]:

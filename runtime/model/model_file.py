@@ -22,10 +22,10 @@ from runtime.model.protobuf import Reader, shown
 PACKAGED_MODELS = (Path(__file__).parents[1] / "models", Path(__file__).parents[2] / "models")
 """Where the paper's model lies: in a wheel inside the package, in a checkout at the top."""
 LARGEST_FILE_BYTES = 2**27
-"""Size of the largest file that is read, 100 times the paper's model. These limits and those of `onnx_subset`, `protobuf` and
-`operators.graph` are what loads, or is refused, within two seconds of a slow core."""
+"""Size of the largest file that is read, 100 times the paper's model. This and the limits of `onnx_subset`, `protobuf` and
+`operators.graph` are such that any file is loaded or refused within two seconds of a slow core."""
 LARGEST_METADATA_BYTES = 2**22
-"""Size of the largest metadata that are parsed, those of some 25,000 cells."""
+"""Size of the largest metadata that are parsed: a scene of some 25,000 cells has as much."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class ModelFile:
 
 
 def read_model(path: Path) -> bytes:
-    """The file's bytes. Raises `ModelError` if it cannot be read, is none, or is too large to be a model."""
+    """The bytes of a model file. Raises `ModelError` if there is no such file, or if it is unreadable or too large to be a model."""
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode) or status.st_size > LARGEST_FILE_BYTES:

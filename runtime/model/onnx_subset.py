@@ -22,9 +22,9 @@ from runtime.model.operators.tensor import DTYPES, LARGEST_RANK, Tensor
 from runtime.model.protobuf import Message, Reader, number_of, numbers_of, only_of, parts_of, shown, text_of
 
 MOST_VALUES = 2**13
-"""Constants, inputs and outputs of a graph, each."""
+"""Most constants, most inputs and most outputs that a graph may have."""
 MOST_NUMBERS = 4 * LARGEST_RANK
-"""Numbers of a shape or an attribute that are read: twice as many as any has."""
+"""Most numbers that are read of a shape or an attribute: twice as many as one may have."""
 
 MODEL = Message(
     "a file",

@@ -1,7 +1,7 @@
 """Protocol Buffers messages from the wire format, field by field: no field is read that is not asked for by its number.
 
-So that the runtime needs no protobuf package, and a file is read once, in time proportional to its size. What a message may hold is a
-`Message`; whatever else it holds is told by name.
+The runtime then needs no protobuf package, and a file is read once, in time proportional to its size. A `Message` says what a message may
+hold; whatever else a file holds is reported by name.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Reader:
 
 
 def number_of(values: list[Value]) -> int:
-    """The number of a field that occurs at most once, 0 without it. Raises ValueError if it is none."""
+    """The number in a field that occurs at most once; 0 where the field is left out. Raises ValueError where the field holds bytes."""
     (value,) = values or [0]
     if not isinstance(value, int):
         raise ValueError("bytes in place of a number")
@@ -85,7 +85,7 @@ def numbers_of(values: list[Value], most: int) -> list[int]:
 
 
 def only_of(values: list[Value]) -> memoryview:
-    """The value of a field of bytes that occurs at most once, empty without it."""
+    """The bytes in a field that occurs at most once; empty where the field is left out."""
     (value,) = parts_of(values) or [memoryview(b"")]
     return value
 
@@ -99,7 +99,7 @@ def parts_of(values: list[Value]) -> list[memoryview]:
 
 
 def text_of(values: list[Value]) -> str:
-    """The text of a field that occurs at most once, empty without it."""
+    """The text in a field that occurs at most once; empty where the field is left out."""
     return bytes(only_of(values)).decode("utf-8")
 
 

@@ -27,7 +27,7 @@ from runtime.recordings.packet import Notes, RecordingError, packet_of
 FIRST_LINE = b"#!AER-DAT4.0\r\n"
 LONGEST_HEADER_BYTES = 2**24
 LONGEST_PACKET_BYTES = 2**28
-"""Of a packet, packed or unpacked: 16 million events."""
+"""Bytes of the longest packet that is read, packed or unpacked: 16 million events."""
 STORED = np.dtype([("t", "<i8"), ("x", "<i2"), ("y", "<i2"), ("on", "u1"), ("unused", "V3")])
 UNPACKED, LZ4, LZ4_HIGH, ZSTD, ZSTD_HIGH = range(5)
 NO_INDEX = -1

@@ -35,9 +35,9 @@ Method = Callable[[NDArray[np.uint8]], object]
 CLUTTER = (0.0, 0.01, 0.02, 0.05)
 WINDOW_US = 40_000
 WARM_UP, WORKERS = 100, 2
-"""Of the throughput: frames that are not counted, and cores of `estimate_many`."""
+"""When throughput is measured: frames ahead of those that are counted, and cores that `estimate_many` takes."""
 THROUGHPUT_CLUTTER = 0.02
-"""Of the frames whose throughput is measured."""
+"""Share of lit pixels of the clutter when throughput is measured."""
 REFERENCE = "HoughLinesP"
 """The detector that ratios refer to."""
 

@@ -11,11 +11,11 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from runtime.recordings.draw import Colour, Picture
 
 WIDTH_IN = 6.4
-"""Of every chart, in inches; a wider picture has more pixels an inch, and larger letters with them."""
+"""Width of every chart, in inches; a wider picture has more pixels an inch, and larger letters with them."""
 EDGE_IN = 0.08
-"""Kept free around the figure and between its parts."""
+"""Margin around the figure and between its parts, in inches."""
 INK, PALE, BLUE, GREY, RED = (40, 40, 40), (205, 205, 205), (170, 110, 40), (160, 160, 160), (40, 40, 200)
-"""On white: letters, grids, and what is compared."""
+"""Colours on white: of letters, of grids, and of what is compared."""
 FONT_PT, SMALL_PT = 9.0, 7.0
 """Letters of `FONT_PT` are 25 px high in a picture 1280 px wide: readable where a page shows it at 640."""
 

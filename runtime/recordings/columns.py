@@ -25,7 +25,7 @@ ORDERS = ("txyp", "xypt", "xytp")
 """By our own files and most others; by Prophesee's converter; by MVSEC."""
 LARGEST_PIXEL = 16_384
 FEW_EVENTS = 100
-"""Of so few, the order of times says nothing of the order of columns."""
+"""With so few events, the order of times says nothing of the order of columns."""
 NUMBERS = "iufb"
 """Kinds of types that a column can have."""
 Block = dict[str, NDArray[Any]]
@@ -50,7 +50,7 @@ _COLUMNS = {
 
 
 def column_of(name: str) -> tuple[str, str] | None:
-    """Which of t, x, y, p a column of that name is, with the unit that its name tells or ""; None if it is none of them."""
+    """Which of t, x, y, p a column of that name is, with the unit that its name tells or ""; None for any other column."""
     plain = re.sub(r"^events?_", "", name.strip(" \t\"'").lower())
     for column, pattern in _COLUMNS.items():
         if match := re.fullmatch(pattern, plain):
@@ -95,7 +95,7 @@ def _signed(p: NDArray[Any]) -> NDArray[Any]:
 
 
 def _no_polarity(p: NDArray[Any]) -> NDArray[np.bool_]:
-    """Which are none of -1, 0 and 1."""
+    """True for numbers that are no polarity: other than -1, 0 and 1."""
     p = _signed(p)
     outside = (p < -1) | (p > 1)
     return outside | (p != np.rint(p)) if p.dtype.kind == "f" else outside

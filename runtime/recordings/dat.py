@@ -20,7 +20,7 @@ from runtime.recordings.time_words import Unwrapped
 
 PIXEL_TYPES = (0, 12)
 BITS = {"1": (9, 8), "2": (14, 14)}
-"""Of x and y, by the version in the header; a file that tells none is of version 2."""
+"""Bits of x and y by the version in the header; a file whose header has no version is of version 2."""
 EVENT_BYTES = 8
 TYPE_AND_SIZE_BYTES = 2
 CLOCK_US = 2**32

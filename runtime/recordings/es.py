@@ -1,4 +1,5 @@
-"""Event Stream files, read by faery. A cut file's last event goes without a word, as the format does not say how many there are."""
+"""Event Stream files, read by faery. The last event of a file that was cut is lost silently, as the format does not
+say how many there are."""
 
 from __future__ import annotations
 

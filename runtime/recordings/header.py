@@ -1,4 +1,5 @@
-"""The text at the start of Prophesee's RAW and DAT files: lines `% keyword value`, up to `% end` or to the first that is none."""
+"""The text at the start of Prophesee's RAW and DAT files: lines `% keyword value`, up to `% end` or to the first line of
+another form."""
 
 from __future__ import annotations
 

@@ -24,11 +24,11 @@ WIDTH_PX = 1280
 PANEL_IN, LEGEND_AND_TIME_IN = 1.3, 0.8
 """Heights of one axis's panel, and of what all panels share."""
 MARGIN = 0.2
-"""Of a panel above and below the domain, as a share of the domain's width."""
+"""What a panel shows above and below the domain, as a share of the domain's width."""
 BAND = (0, 85, 130)
 """Amber as it looks over the background."""
 MARK_HEIGHT = 0.05
-"""Of the mark where nothing is certified, at the foot of a panel, as a share of its height."""
+"""Height of the mark where nothing is certified, at the foot of a panel, as a share of the panel's."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ WIDTH_PX = 1280
 ROW_IN, PANEL_IN, FRAME_IN = 0.17, 0.35, 1.1
 """Heights of a method's row, of what a panel needs besides, and of what all panels share."""
 LETTERS = 110
-"""Of a line of small letters, at most."""
+"""Most letters on a line of small ones."""
 
 
 def latency_chart(header: Mapping[str, str], rows: Sequence[Latency]) -> Picture:

@@ -9,7 +9,7 @@ from runtime.frames import FrameStream
 from runtime.recordings.packet import Notes
 
 BREAKS_TOLD = 3
-"""On the screen; summary.json has more."""
+"""Breaks of the clock that are told on the screen; summary.json has more."""
 
 
 def noted_of(stream: FrameStream, notes: Notes) -> dict[str, Any]:

@@ -86,7 +86,7 @@ def _table_packets(path: Path, array: Array, notes: Notes) -> Iterator[NDArray[A
 
 
 def _names(path: Path) -> list[str]:
-    """Of the arrays in the file; "" for the one in an npy file."""
+    """Names of the arrays in the file; "" for the one in an npy file."""
     if path.suffix.lower() == ".npy":
         return [""]
     with zipfile.ZipFile(path) as archive:

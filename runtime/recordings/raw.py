@@ -199,7 +199,7 @@ def _lit_bits(masks: NDArray[Any]) -> tuple[NDArray[np.intp], NDArray[np.int32]]
 
 
 FORMATS = {"2": Evt2, "2.0": Evt2, "2.1": Evt21, "21": Evt21, "3": Evt3, "3.0": Evt3}
-"""By what a header says after `evt` or `format EVT`."""
+"""Decoders by what a header says after `evt` or `format EVT`."""
 
 
 def sensor_shape(path: Path) -> tuple[int, int] | None:

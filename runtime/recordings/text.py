@@ -157,7 +157,7 @@ class _Reader:
 
 
 def _tried(count: int, attempt: Callable[[int], NDArray[Any]]) -> tuple[NDArray[Any], int, str]:
-    """What the attempt gives for the most of `count` lines for which it gives something, how many these are, and why not for more.
+    """The attempt's result on as many of the first `count` lines as it can take, how many these are, and why it takes no more.
 
     The attempt raises ValueError if one of the first lines is faulty: halving finds how many are good.
     """

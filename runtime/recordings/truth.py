@@ -56,7 +56,7 @@ class Judgement:
     shortfall: Shortfall
     """What the frame lacks of the true runway."""
     assumptions_hold: bool
-    """That is within the budget and the truth lies in the domain: Theorem A promises a box with the truth in it."""
+    """The shortfall is within the budget and the truth lies in the domain: Theorem A promises a box with the truth in it."""
     inside: bool
     """There is a box and the truth lies in it."""
     error: NDArray[np.float64] | None

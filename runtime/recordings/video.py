@@ -11,9 +11,9 @@ from runtime.recordings.draw import Picture
 from runtime.whole_file import OutputError, OutputFolder
 
 WIDTH = 640
-"""Of its pictures, px, whatever the sensor's is: their text can still be read."""
+"""Width of its pictures, px, whatever the sensor's is: their text can still be read."""
 MOST_A_SECOND = 10
-"""Pictures a second of the recording; of more windows every second, third, ... is shown. So many of random pixels take 0.9 MB."""
+"""Most pictures a second of the recording; of more windows every second, third, ... is shown. Ten of random pixels take 0.9 MB."""
 
 LEAST_A_SECOND = 0.1
 """Longer windows are shown for 10 s each: the encoder takes no slower video."""
@@ -25,7 +25,7 @@ class Video:
     def __init__(self, outputs: OutputFolder, name: str, step_us: int) -> None:
         """`step_us`: from one window to the next."""
         self.every = max(1, -(-1_000_000 // (MOST_A_SECOND * step_us)))
-        """One window of so many is shown."""
+        """One window in this many is shown."""
         self._outputs, self._name, self._step_us = outputs, name, step_us
         self._path = outputs.folder / name
         self._writer: Any = None

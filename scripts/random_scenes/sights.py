@@ -62,7 +62,7 @@ class Outlook:
         return float(ground_scale(self.camera, self.theta, self.y, row))
 
     def on_ground(self, far: float, near: float) -> tuple[float, float]:
-        """The rows of a marking's ends, drawn in to ground that is not too far and not behind. Raises `UndrawableError` if none is left."""
+        """The rows of a marking's ends, moved onto ground neither too far nor behind. Raises `UndrawableError` if there is none."""
         psi_far, psi_near = max(self.angle(far), self.flattest), min(self.angle(near), STRAIGHT_DOWN_RAD)
         if not psi_far < psi_near:
             raise UndrawableError("no ground there")

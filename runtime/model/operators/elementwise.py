@@ -35,7 +35,7 @@ def comparison(call: Call) -> Sequence[Tensor]:
 
 
 def division(call: Call) -> Sequence[Tensor]:
-    """Div and Mod. Integers have a constant divisor without 0, and -1, by which the smallest cannot be divided: a processor traps there."""
+    """Div and Mod. Integers are divided by constants alone, without 0 and -1: a processor traps at x / 0 and at the smallest x / -1."""
     (result,) = elementwise(call)
     divisor = call.operand(1).values
     if result.dtype.kind != "f":
@@ -48,7 +48,7 @@ def division(call: Call) -> Sequence[Tensor]:
 
 
 def power(call: Call) -> Sequence[Tensor]:
-    """Of the base's type, whatever the exponent's."""
+    """Pow: of the base's type, whatever the exponent's is."""
     base, exponent = call.operands()
     call.demand(exponent.dtype.kind in "fi", f"of types {base.dtype}, {exponent.dtype}")
     return [Tensor(base.dtype, call.broadcast(base.shape, exponent.shape))]
@@ -90,7 +90,7 @@ def along_axis(call: Call) -> Sequence[Tensor]:
 
 
 def dropout(call: Call) -> Sequence[Tensor]:
-    """Does nothing outside of training, which would need a third input."""
+    """Dropout does nothing outside of training, for which it would need a third input."""
     call.demand_shape(1, ())
     return same(call)
 

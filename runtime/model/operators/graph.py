@@ -55,7 +55,7 @@ def check_nodes(nodes: Sequence[Node], given: Mapping[str, Tensor]) -> dict[str,
 
 
 def _given(node: Node, known: Mapping[str, Tensor]) -> Sequence[Tensor]:
-    """What a node gives."""
+    """Types and shapes of what a node gives. Raises `ModelError`."""
     missing = [name for name in node.inputs if name and name not in known]
     if missing:
         raise ModelError(f"found {shown(node.operator)} before {shown(missing[0])}, which it reads; export the network again")

@@ -77,7 +77,7 @@ def gather_nd(call: Call) -> Sequence[Tensor]:
 
 
 def padding(call: Call) -> Sequence[Tensor]:
-    """By constants before and behind; what is cut off leaves something, and what is mirrored or repeated is there."""
+    """Pad, by constant amounts before and behind. Negative amounts must leave something, and what is mirrored or repeated must exist."""
     data, pads = call.operand(0), call.whole_numbers(1) or []
     axes = call.axes(range(data.rank) if (numbers := call.whole_numbers(3)) is None else numbers, data.rank)
     call.demand(len(pads) == 2 * len(axes), f"of {len(axes)} axes by {pads}")
@@ -95,7 +95,7 @@ def padding(call: Call) -> Sequence[Tensor]:
 
 
 def reshape(call: Call) -> Sequence[Tensor]:
-    """To a constant shape, in which 0 stands for the size as it is, unless `allowzero`, and one -1 for what is left."""
+    """To a constant shape, in which 0 keeps the input's size at its place, unless `allowzero`, and one -1 takes what is left."""
     data, numbers = call.operand(0), call.whole_numbers(1) or []
     copied = not call.attributes["allowzero"]
     wanted = [data.shape[axis] if copied and size == 0 and axis < data.rank else size for axis, size in enumerate(numbers)]

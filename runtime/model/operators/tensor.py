@@ -39,7 +39,7 @@ class Tensor:
     working_bytes: int = field(default=0, compare=False)
     """What its operator needs besides while it runs."""
     values: NDArray[Any] | None = field(default=None, compare=False)
-    """Of a constant."""
+    """The numbers themselves, where they are a constant's."""
 
     def __str__(self) -> str:
         """Type and shape."""
