@@ -253,6 +253,21 @@ def test_after_ctrl_c_what_was_done_is_written(recording, tmp_path, monkeypatch)
     assert not list(tmp_path.glob("*.part*"))
 
 
+def test_ctrl_c_while_files_are_finished_leaves_the_earlier_ones(recording, tmp_path, monkeypatch):
+    assert invoke(MODEL, recording, "-o", tmp_path, "--no-video", "--no-refine").exit_code == 0
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("runtime.recordings.report.draw_history", interrupted)
+    done = invoke(MODEL, recording, "-o", tmp_path)
+    assert done.exit_code == 130
+    assert done.stderr.startswith(f"{tmp_path}: interrupted")
+    assert done.stderr.count("\n") == 1
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
 def without_pixels(events: NDArray, window: int, pixels: NDArray) -> NDArray:
     """The events but for those of a window in the given pixels, (n, 2) row and column."""
     dead = np.isin(events["y"] * 640 + events["x"], pixels @ [640, 1]) & (events["t"] // 40_000 == window)
