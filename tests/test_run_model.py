@@ -333,7 +333,7 @@ run_model_command()
 """
     command = [sys.executable, "-c", limited, MODEL, recording, "-o", tmp_path, *options]
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
-    done = subprocess.run([str(part) for part in command], env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run([str(part) for part in command], env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 2
     assert done.stderr.startswith(str(tmp_path))
     assert message in done.stderr
@@ -410,9 +410,8 @@ def test_without_opencv_one_line_says_what_to_install(recording):
     """In an interpreter of its own, as the installed command: an entry of None makes an import fail as if nothing were installed."""
     program = "import sys; sys.modules['cv2'] = None; from runtime.recordings.cli import run_model_command; run_model_command()"
     arguments = ["run-model", str(MODEL), str(recording)]
-    done = subprocess.run(
-        [sys.executable, "-c", f"import sys; sys.argv = {arguments!r}; {program}"], capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-c", f"import sys; sys.argv = {arguments!r}; {program}"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 2
     assert done.stderr.strip() == "run-model: the package 'cv2' is missing; pip install 'glideproof[recordings]'"
 
