@@ -3,7 +3,7 @@
 `run` starts a command so that its work does not depend on who reads it: where stdout or stderr is closed, or its reader has gone, as
 in `run-model ... | head -1`, what is left to print is dropped, the files are written all the same, and the exit code is the command's own.
 A stdout that fails otherwise, as a file on a full disk, is told on stderr, with exit code 2. A signal to end (SIGTERM, SIGHUP) is taken as
-Ctrl-C.
+Ctrl-C, after which a command that has nothing to say of its own ends in one line and exit code 130.
 
 `console` is rich's, without its markup: a file called `run[/]x` or `:cat:` is printed under its name. rich and typer come with the extras,
 and are imported when they are needed.
@@ -12,13 +12,15 @@ and are imported when they are needed.
 from __future__ import annotations
 
 import contextlib
+import functools
 import os
 import signal
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn, TextIO
 
-from runtime.errors import USER_ERROR, complain
+from runtime.errors import INTERRUPTED, USER_ERROR, complain, fail
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -56,10 +58,23 @@ def _exit_code_of(command: Callable[..., None]) -> int:
     import typer
 
     try:
-        typer.run(command)
+        typer.run(_interruptible(command))
     except SystemExit as end:
         return end.code if isinstance(end.code, int) else 0
     return 0
+
+
+def _interruptible(command: Callable[..., None]) -> Callable[..., None]:
+    """The command, of the same parameters, that tells an interrupt which it does not handle: typer would end it without a word."""
+
+    @functools.wraps(command)
+    def telling(*arguments: Any, **options: Any) -> None:
+        try:
+            command(*arguments, **options)
+        except KeyboardInterrupt:
+            fail(f"{Path(sys.argv[0]).name}: interrupted", INTERRUPTED)
+
+    return telling
 
 
 def _end_as_by_ctrl_c() -> None:

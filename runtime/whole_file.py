@@ -106,8 +106,13 @@ class OutputFolder:
 
 
 def _replaceable(path: Path) -> Path:
-    """The file that a name stands for, through links, which stay. Raises OSError for a device or a pipe: as root, renaming replaces it."""
-    if path.exists() and not (path.is_file() or path.is_dir()):
+    """The file that a name stands for, through links, which stay.
+
+    Raises OSError for a folder, which could not be replaced once all is done, and for a device or a pipe: as root, renaming replaces it.
+    """
+    if path.is_dir():
+        raise OSError(errno.EISDIR, "it is a folder", str(path))
+    if path.exists() and not path.is_file():
         raise OSError(errno.EINVAL, "it is no file but a device or a pipe", str(path))
     return path.resolve() if path.is_symlink() else path
 

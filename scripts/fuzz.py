@@ -47,7 +47,7 @@ from runtime.recordings.recording import RecordingError, read_events
 from runtime.scene import Scene
 
 CASE_SECONDS = 60
-"""A case that takes longer hangs; an AEDAT4 file, read by processes of their own, takes 20 s on a machine that is busy otherwise."""
+"""A case that takes longer hangs; a machine that is busy otherwise is given time."""
 LOAD_SECONDS = 2
 """Processor time that loading or refusing a model may take."""
 MEMORY_BYTES = 4 * 2**30

@@ -264,6 +264,7 @@ def test_links_out_of_a_file_and_in_circles_are_not_followed(tmp_path):
         ("temperature", None),
         ("xyz", None),
         ("", None),
+        *[(f"x{rest}", ("x", "")) for rest in (" [px]", "(pixels)", "_px", "pos", "")],
     ],
 )
 def test_names_tell_columns_and_units(name, wanted):

@@ -38,6 +38,7 @@ def estimate_of(box: Box | None, filtered: NDArray) -> Estimate:
         filtered=filtered,
         regions=() if box is None else (box,),
         touches_boundary=False,
+        assumed=(),
     )
 
 

@@ -246,9 +246,12 @@ def test_unusable_npz_columns_are_refused(tmp_path, columns, message):
         list(read_events(tmp_path / "a.npz"))
 
 
-def test_a_missing_file_is_refused_at_once(tmp_path):
-    with pytest.raises(RecordingError, match="no such file"):
-        read_events(tmp_path / "a.raw")
+def test_a_missing_file_and_what_is_no_file_are_refused_at_once(tmp_path):
+    os.mkfifo(tmp_path / "pipe.raw")
+    (tmp_path / "folder.raw").mkdir()
+    for name, message in (("a.raw", "no such file"), ("pipe.raw", "is no file but"), ("folder.raw", "is no file but a folder")):
+        with pytest.raises(RecordingError, match=rf"{name}: {message}.*; give the path of a recording"):
+            read_events(tmp_path / name)
 
 
 @pytest.mark.parametrize(

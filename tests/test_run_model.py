@@ -253,6 +253,21 @@ def test_after_ctrl_c_what_was_done_is_written(recording, tmp_path, monkeypatch)
     assert not list(tmp_path.glob("*.part*"))
 
 
+def test_ctrl_c_while_files_are_finished_leaves_the_earlier_ones(recording, tmp_path, monkeypatch):
+    assert invoke(MODEL, recording, "-o", tmp_path, "--no-video", "--no-refine").exit_code == 0
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("runtime.recordings.report.draw_history", interrupted)
+    done = invoke(MODEL, recording, "-o", tmp_path)
+    assert done.exit_code == 130
+    assert done.stderr.startswith(f"{tmp_path}: interrupted")
+    assert done.stderr.count("\n") == 1
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
 def without_pixels(events: NDArray, window: int, pixels: NDArray) -> NDArray:
     """The events but for those of a window in the given pixels, (n, 2) row and column."""
     dead = np.isin(events["y"] * 640 + events["x"], pixels @ [640, 1]) & (events["t"] // 40_000 == window)
@@ -318,7 +333,7 @@ run_model_command()
 """
     command = [sys.executable, "-c", limited, MODEL, recording, "-o", tmp_path, *options]
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
-    done = subprocess.run([str(part) for part in command], env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run([str(part) for part in command], env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 2
     assert done.stderr.startswith(str(tmp_path))
     assert message in done.stderr
@@ -395,9 +410,8 @@ def test_without_opencv_one_line_says_what_to_install(recording):
     """In an interpreter of its own, as the installed command: an entry of None makes an import fail as if nothing were installed."""
     program = "import sys; sys.modules['cv2'] = None; from runtime.recordings.cli import run_model_command; run_model_command()"
     arguments = ["run-model", str(MODEL), str(recording)]
-    done = subprocess.run(
-        [sys.executable, "-c", f"import sys; sys.argv = {arguments!r}; {program}"], capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-c", f"import sys; sys.argv = {arguments!r}; {program}"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 2
     assert done.stderr.strip() == "run-model: the package 'cv2' is missing; pip install 'glideproof[recordings]'"
 

@@ -82,6 +82,24 @@ def test_a_signal_to_end_is_taken_as_ctrl_c(tmp_path: Path, name: str) -> None:
     assert (tmp_path / "done").read_text() == "so far"
 
 
+def test_an_interrupt_that_a_command_does_not_handle_ends_it_in_a_line(tmp_path: Path) -> None:
+    program = """
+        import os, signal
+        from typing import Annotated
+        import typer
+        from runtime import terminal
+        def work(times: Annotated[int, typer.Option(min=2)] = 3):
+            print(times)
+            os.kill(os.getpid(), signal.SIGINT)
+            signal.pause()
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # which a shell's background jobs do without
+        terminal.run(work)
+    """
+    done = started("$RUN --times 4", tmp_path, program)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "4\n", "program.py: interrupted\n")
+    assert started("$RUN --times 1", tmp_path, program).returncode == 2  # the options and their limits are still the command's
+
+
 def test_a_signal_that_is_ignored_stays_so(tmp_path: Path) -> None:
     program = """
         import os, signal

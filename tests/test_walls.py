@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import graphlib
 import subprocess
 import sys
@@ -107,6 +108,15 @@ def test_the_runtime_never_imports_build_model_or_scripts() -> None:
     runtime = [name for name in MODULES if name.startswith("runtime")]
     assert {name: direct_imports(name) - set(runtime) for name in runtime if direct_imports(name) - set(runtime)} == {}
     assert "runtime.scene" in direct_imports("build_model.partition")
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if name.startswith("runtime.recordings")])
+def test_the_extra_recordings_imports_at_the_top(module: str) -> None:
+    """A reader with a package of its own is a module of its own, which `recording` imports when a file asks for it."""
+    path = source_of(module, ROOTS)
+    assert path is not None
+    functions = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)]
+    assert not any(isinstance(inner, ast.Import | ast.ImportFrom) for function in functions for inner in ast.walk(function))
 
 
 # --- the demonstration ---

@@ -137,6 +137,23 @@ def test_a_device_or_a_pipe_is_never_replaced(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {"pipe.csv", "null.csv"}
 
 
+def test_a_folder_of_a_files_name_is_found_before_anything_is_replaced(tmp_path: Path) -> None:
+    """As the last of several files it would be found when the others have replaced the old ones."""
+    (tmp_path / "a.csv").write_text("old")
+    (tmp_path / "film.mp4").mkdir()
+    (tmp_path / "link.csv").symlink_to(tmp_path / "film.mp4")
+    outputs = OutputFolder(tmp_path)
+    outputs.write("a.csv", b"new")
+    for name in ("film.mp4", "link.csv"):
+        with pytest.raises(OutputError, match=rf"{name}: cannot be written \(it is a folder\); give another folder"):
+            outputs.begin(name)
+        with pytest.raises(OSError, match="it is a folder"), replacing(tmp_path / name):
+            pass
+    outputs.discard()
+    assert (tmp_path / "a.csv").read_text() == "old"
+    assert {path.name for path in tmp_path.iterdir()} == {"a.csv", "film.mp4", "link.csv"}
+
+
 def test_a_file_is_made_with_the_rights_that_any_other_has(tmp_path: Path) -> None:
     (tmp_path / "other").write_bytes(b"")
     write_whole(tmp_path / "a.csv", b"new")

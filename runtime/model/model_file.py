@@ -47,16 +47,14 @@ def read_model(path: Path) -> bytes:
     """The bytes of a model file. Raises `ModelError` if there is no such file, or if it is unreadable or too large to be a model."""
     try:
         status = path.stat()
-        if not stat.S_ISREG(status.st_mode) or status.st_size > LARGEST_FILE_BYTES:
-            limit = f"files of up to {LARGEST_FILE_BYTES >> 20} MiB are read"
-            raise ModelError(
-                f"{path}: cannot be read (not a file, or of {status.st_size} bytes); {limit}: give a model that export-model wrote"
-            )
-        return path.read_bytes()
+        if stat.S_ISREG(status.st_mode) and status.st_size <= LARGEST_FILE_BYTES:
+            return path.read_bytes()
     except OSError as error:
         raise ModelError(f"{path}: cannot be read ({error.strerror}); give the path of a model that export-model wrote") from error
     except ValueError as error:  # a null character in the path
         raise ModelError(f"{str(path)!r}: cannot be read ({error}); give the path of a model that export-model wrote") from error
+    found = f"of {status.st_size} bytes" if stat.S_ISREG(status.st_mode) else "no file but a folder, a device or a pipe"
+    raise ModelError(f"{path}: is {found}; give the path of a model that export-model wrote, of up to {LARGEST_FILE_BYTES >> 20} MiB")
 
 
 def packaged_model() -> Path:

@@ -65,9 +65,11 @@ def run_model(
     """Take a recording to states and certified boxes: estimates.csv, summary.json, pictures and a video.
 
     Exit code 0; 1 if the recording is damaged or ends early (what was good before is written); 2 if something given cannot be used, as
-    a truth within whose times no window lies (the estimates are written); 130 after Ctrl-C (what was done is written).
+    a truth within whose times no window lies (the estimates are written); 130 after Ctrl-C (what was done is written, unless that is
+    interrupted too).
     """
     console = terminal.console()
+    folder = output or Path("out") / recording.stem
     try:
         estimator = Estimator.load(model, missed_budget=missed_budget)
         step_us = None if step_ms is None else _microseconds(step_ms)
@@ -75,7 +77,6 @@ def run_model(
         stream = FrameStream(estimator.scene.camera.shape, _microseconds(window_ms), step_us, largest_gap_us=gap_us)
         known = None if truth is None else Truth.load(truth)
         packets = _nonempty(recording, read_events(recording, estimator.scene.camera.shape, notes))
-        folder = output or Path("out") / recording.stem
         inputs = [path for path in (model, recording, truth) if path is not None]
         with Report(folder, estimator, stream.window_us, stream.step_us, known, video=video, inputs=inputs) as report:
             fault, code = _estimated(console, stream, packets, report, refine)
@@ -86,6 +87,8 @@ def run_model(
         fail(error)
     except OSError as error:
         fail(f"{recording}: cannot be read ({error.strerror or error}); give the path of a recording that can")
+    except KeyboardInterrupt:
+        fail(f"{folder}: interrupted before or after the windows; nothing is written, earlier files are untouched", INTERRUPTED)
     _print_summary(console, folder, summary)
     for line in lines_of(noted):
         complain(f"{recording}: {line}")

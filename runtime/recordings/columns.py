@@ -41,10 +41,11 @@ UNIT_NAMES = {
     "s": ("s", "sec", "second", "seconds"),
 }
 _UNIT_OF_NAME = {name: unit for unit, names in UNIT_NAMES.items() for name in names}
+_OF_A_PIXEL = r"(?:[ _(\[]*(?:px|pixels?|pos|coord|addr|address)[)\]]?)"
 _COLUMNS = {
     "t": rf"(?:t|ts|times?|timestamps?)(?:[ _(\[]+(?P<unit>{'|'.join(_UNIT_OF_NAME)})[)\]]?)?",
-    "x": "x|xs|x_?(?:px|pos|coord|addr|address)",
-    "y": "y|ys|y_?(?:px|pos|coord|addr|address)",
+    "x": rf"xs?|x{_OF_A_PIXEL}",
+    "y": rf"ys?|y{_OF_A_PIXEL}",
     "p": "p|ps|pols?|polarity|polarities|on",
 }
 

@@ -80,7 +80,8 @@ def sensor_shape(path: str | Path) -> tuple[int, int] | None:
     """The sensor's (height, width) as the file tells it, or None if it does not. Raises `RecordingError`."""
     path = Path(path)
     if not path.is_file():
-        raise RecordingError(f"{path}: no such file; give the path of a recording")
+        found = "is no file but a folder, a device or a pipe" if path.exists() else "no such file"
+        raise RecordingError(f"{path}: {found}; give the path of a recording")
     if path.stat().st_size == 0:
         raise RecordingError(f"{path}: the file is empty; record or copy it again")
     return _reader(path).sensor_shape(path)
