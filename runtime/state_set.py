@@ -26,6 +26,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from runtime.rounding import lowered, raised
 from runtime.scene import Camera
+from runtime.turn import cosine_and_sine
 
 Floats = NDArray[np.float64]
 
@@ -78,7 +79,7 @@ class StateSet:
     @cached_property
     def turn(self) -> tuple[Floats, Floats]:
         """Cosine and sine of theta, (sets, 2) each."""
-        return np.cos(self.theta), np.sin(self.theta)
+        return cosine_and_sine(self.theta)
 
     @cached_property
     def reference_fall(self) -> Floats:

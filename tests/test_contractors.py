@@ -1,0 +1,359 @@
+"""Each contractor by itself: the true state stays in the set, decided in fractions at every scale, and what is left is narrow."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from rational_image import RationalState, RationalView, turn
+from scenes import PAPER, examples
+
+from runtime.refine.altitude import contract_by_altitude
+from runtime.refine.claims import contract_by_claims, offsets_by_claims
+from runtime.refine.crossings import offsets_at_crossings
+from runtime.refine.end_pixels import offsets_at_ends
+from runtime.refine.ends import contract_by_ends
+from runtime.refine.interval import Interval, relaxed_intersection
+from runtime.refine.lit_columns import LitColumns
+from runtime.refine.lit_pixels import LitPixels
+from runtime.refine.missed import Missed
+from runtime.refine.offsets import contract_by_offsets
+from runtime.refine.sight import Claims, Sight
+from runtime.scene import Axis, Camera, Domain, Marking, Runway, Scene, SceneError
+from runtime.state_set import StateSet, end_rows, tangent_of_row
+
+Frame = NDArray[np.bool_]
+WHOLE = slice(None), slice(None)
+CONTRACTORS = {"offsets": contract_by_offsets, "claims": contract_by_claims, "ends": contract_by_ends}
+SOURCES: dict[str, Callable[[StateSet, Sight], Interval]] = {
+    "crossings": lambda _, sight: offsets_at_crossings(sight),
+    "end pixels": offsets_at_ends,
+    "claims": lambda sets, sight: offsets_by_claims(sets, sight, sight.claims) if sight.claims else (_none(sight), -_none(sight)),
+}
+
+
+def _none(sight: Sight) -> NDArray[np.float64]:
+    return np.full(sight.borders.near[0].shape, -np.inf)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A true state of a scene, its image, and a set of states that holds it."""
+
+    scene: Scene
+    state: RationalState
+    sets: StateSet
+    image: Frame
+
+    def scale(self) -> Fraction:
+        """g at the set's reference row, px per metre, exactly."""
+        camera = self.scene.camera
+        focal = Fraction(camera.focal_length_m) / Fraction(camera.pixel_pitch_m)
+        row = Fraction(camera.v0) + focal * Fraction(float(self.sets.tangent[0]))
+        cosine, sine = turn(self.state.tangent)
+        return (cosine * (row - Fraction(camera.v0)) + focal * sine) / self.state.y
+
+    def held_by(self, sets: StateSet) -> bool:
+        """Is the state in what is left of the set? Decided in fractions."""
+        slow, fast = sets.scale[0].tolist()
+        return self.state.within(sets.lower[0], sets.upper[0]) and slow <= self.scale() <= fast
+
+    def seen(self, frame: Frame, budget: int, claimed_budget: int = -1) -> Sight:
+        """What the frame shows; with a `claimed_budget` all that is lit is claimed but for so many pixels."""
+        claims = None if claimed_budget < 0 else Claims(LitPixels.of(frame, WHOLE, beyond=False), claimed_budget)
+        return Sight.of(self.scene, self.sets, LitPixels.of(frame, WHOLE, beyond=True), budget, claims)
+
+
+def spread(low: float, high: float) -> st.SearchStrategy[float]:
+    """Numbers between two, over their orders of magnitude."""
+    return st.floats(math.log10(low), math.log10(high)).map(lambda exponent: 10.0**exponent)
+
+
+def around(draw: st.DrawFn, value: float, width: float) -> list[float]:
+    """An interval of up to that width that holds the value, often at its end."""
+    width *= draw(st.sampled_from([0.0, 0.01, 0.1, 1.0]))
+    share = draw(st.sampled_from([0.0, 0.3, 1.0]))
+    return [value - share * width, value + (1 - share) * width]
+
+
+@st.composite
+def cases(draw: st.DrawFn) -> Case:
+    """Cameras of 32 to 320 px from 0.3 to 300 m up over one to three markings; sets up to a few pixels wide."""
+    width, height = draw(st.integers(32, 320)), draw(st.integers(32, 240))
+    camera = Camera(width, height, draw(spread(0.6, 8)) * width * 1e-5, 1e-5)
+    y, slope = draw(spread(0.3, 300)), draw(spread(0.02, 3))  # of altitude over distance, at the nearest end
+    distance = y / slope
+    row = draw(st.floats(0.4, 1.1)) * height  # of the nearest end
+    theta = math.atan(slope) - math.atan((row - camera.v0) / camera.focal_px)
+    shift = draw(st.sampled_from([0.0, 1e4, -98_765.4]))
+    state = RationalState.near([theta, shift, y, distance - shift])
+    scale = camera.focal_px * math.cos(theta) / (distance + y * slope) / (1 + slope * math.tan(theta))  # about that there
+    markings = []
+    for number in range(draw(st.integers(1, 3))):
+        across = (draw(st.floats(-0.1, 1.1)) * width - camera.u0) / scale
+        start = draw(st.sampled_from([0.0, 0.0, 0.1, 0.5])) * distance
+        markings.append(Marking(str(number), shift + across, shift + start, draw(spread(0.1, 30)) * distance))
+    try:
+        axes = [Axis((float(value),), 0.0) for value in state.floats]
+        scene = Scene(camera, Runway(tuple(markings)), Domain(*axes), PAPER.bank)
+    except SceneError:
+        assume(False)
+        raise
+    px = 1 / camera.focal_px
+    theta_x_y_z = [
+        around(draw, value, extent) for value, extent in zip(state.floats, (2 * px, distance * px, 0.1 * y, 0.2 * distance), strict=True)
+    ]
+    tangent = tangent_of_row(camera, np.array([round(min(row, height))]))
+    sets = StateSet(*np.array(theta_x_y_z)[:, None], scale=np.zeros((1, 2)), tangent=tangent)
+    assume(sets.y[0, 0] > 0)
+    assume((sets.z[0, 0] + scene.runway.ends_z_m).min() > 0)
+    assume(sets.reference_fall.min() > 1e-3)
+    case = Case(scene, state, sets, RationalView.of(scene.to_dict()).image(state).frame)
+    true = float(case.scale())
+    sets.scale[:] = np.array(around(draw, true, 0.05 * true)) + np.array([-1, 1]) * 2.0**-45 * true
+    sets.theta[:] += np.array([-1, 1]) * 2.0**-50
+    assume(case.held_by(sets))
+    return case
+
+
+def spoiled(case: Case, data: st.DataObject, most_missed: int, clutter: Frame) -> tuple[Frame, int]:
+    """The image with up to so many pixels dark, which are often neighbours, under clutter; and how many are."""
+    lit = np.flatnonzero(case.image)
+    count = data.draw(st.integers(0, min(most_missed, len(lit))))
+    if count == 0:
+        return case.image | clutter, 0
+    first = data.draw(st.integers(0, len(lit) - 1))
+    step = data.draw(st.sampled_from([1, 1, 2, 7]))
+    dark = np.unique(lit[(first + step * np.arange(count)) % len(lit)])
+    frame = case.image | clutter
+    frame.ravel()[dark] = False
+    return frame, len(dark)
+
+
+def clutter_of(case: Case, data: st.DataObject) -> Frame:
+    density, seed = data.draw(st.sampled_from([0.0, 0.0, 0.02, 0.3])), data.draw(st.integers(0, 1000))
+    return np.random.default_rng(seed).random(case.image.shape) < density
+
+
+def claimed(case: Case, data: st.DataObject) -> tuple[Frame, int]:
+    """Up to six more pixels are lit near the image: the frame, and how many."""
+    near = np.flatnonzero(case.image)[:, None] + np.array([-2, -1, 1, 2])
+    places = np.setdiff1d(near[(near >= 0) & (near < case.image.size)], np.flatnonzero(case.image))
+    assume(len(places) > 0)
+    chosen = places[sorted(data.draw(st.sets(st.integers(0, len(places) - 1), max_size=6)))]
+    frame = case.image.copy()
+    frame.ravel()[chosen] = True
+    return frame, len(chosen)
+
+
+# --- containment ---
+
+
+@pytest.mark.parametrize("name", CONTRACTORS)
+@examples(60)
+@given(case=cases(), data=st.data())
+def test_a_contractor_keeps_the_state_whatever_the_clutter(name: str, case: Case, data: st.DataObject) -> None:
+    frame, missed = spoiled(case, data, 4, clutter_of(case, data))
+    assert case.held_by(CONTRACTORS[name](case.sets, case.seen(frame, missed)))
+
+
+@pytest.mark.parametrize("name", CONTRACTORS)
+@examples(60)
+@given(case=cases(), data=st.data())
+def test_a_contractor_keeps_the_state_with_bounded_clutter(name: str, case: Case, data: st.DataObject) -> None:
+    frame, extra = claimed(case, data)
+    assert case.held_by(CONTRACTORS[name](case.sets, case.seen(frame, 0, extra)))
+
+
+@pytest.mark.parametrize("name", SOURCES)
+@examples(60)
+@given(case=cases(), data=st.data())
+def test_true_offsets_lie_within_their_bounds(name: str, case: Case, data: st.DataObject) -> None:
+    frame, missed = spoiled(case, data, 3, clutter_of(case, data)) if name != "claims" else (case.image, 0)
+    sight = case.seen(frame, missed, 0 if name == "claims" else -1)
+    low, high = SOURCES[name](case.sets, sight)
+    assert sight.missed.left[0] >= 0
+    for marking, x_m in enumerate(case.scene.runway.x_m.tolist()):
+        assert low[marking, 0] <= (Fraction(x_m) - case.state.x) * case.scale() <= high[marking, 0]
+
+
+@examples(60)
+@given(case=cases())
+def test_altitude_and_scale_keep_the_state(case: Case) -> None:
+    assert case.held_by(contract_by_altitude(case.scene.camera, case.sets))
+
+
+# --- tightness: what a clean frame that holds one whole marking tells of a set that is wide in one way alone ---
+
+
+@st.composite
+def whole_markings(draw: st.DrawFn) -> Case:
+    """One marking, all of it in the frame with a margin of 8 px, not flatter than a pixel a row; the set is the state but for 2^-44."""
+    width, height = draw(st.integers(96, 320)), draw(st.integers(96, 240))
+    camera = Camera(width, height, draw(st.floats(0.8, 3)) * width * 1e-5, 1e-5)
+    y, theta = draw(spread(0.3, 300)), draw(st.floats(0.1, 1.0))
+    rows = draw(st.floats(8, height / 2)), draw(st.floats(height / 2 + 4, height - 8))
+    assume((rows[0] - camera.v0) / camera.focal_px + math.tan(theta) > 0.05)
+    far, near = (y / math.tan(theta + math.atan((row - camera.v0) / camera.focal_px)) for row in rows)
+    scales = [camera.focal_px / (y * math.sin(theta) + d * math.cos(theta)) for d in (far, near)]
+    reach = min((width / 2 - 8) / scales[1], (rows[1] - rows[0]) / (scales[1] - scales[0]))
+    across = draw(st.sampled_from([-1, 1])) * draw(st.floats(0.05, 1)) * reach
+    shift = draw(st.sampled_from([0.0, 1e4, -98_765.4]))
+    state = RationalState.near([theta, shift, y, near - shift])
+    axes = [Axis((float(value),), 0.0) for value in state.floats]
+    scene = Scene(camera, Runway((Marking("m", shift + across, shift, far - near),)), Domain(*axes), PAPER.bank)
+    sides = [np.array([[value - 2.0**-44, value + 2.0**-44]]) for value in state.floats]
+    sides[1][:] = shift
+    tangent = tangent_of_row(camera, np.array([round(rows[1])]))
+    sets = StateSet(*sides, scale=np.zeros((1, 2)), tangent=tangent)
+    case = Case(scene, state, sets, RationalView.of(scene.to_dict()).image(state).frame)
+    sets.scale[:] = float(case.scale()) * (1 + np.array([[-1, 1]]) * 2.0**-40)
+    assume(case.held_by(sets))
+    return case
+
+
+def widened(case: Case, **extents: float) -> Case:
+    """Its set with some intervals so much wider on both sides."""
+    wide = {name: getattr(case.sets, name) + np.array([-extent, extent]) for name, extent in extents.items()}
+    return replace(case, sets=replace(case.sets, **wide))
+
+
+def lit_rows(case: Case) -> tuple[int, int]:
+    """The first and the last row in which the image is lit."""
+    rows = np.flatnonzero(case.image.any(axis=1))
+    return int(rows[0]), int(rows[-1])
+
+
+@examples(60)
+@given(case=whole_markings(), budget=st.integers(0, 2))
+def test_borders_tell_an_offset_to_a_pixel_at_the_lowest_one(case: Case, budget: int) -> None:
+    """A marking lights the pixels of its column on both sides of a border, and no others there: a pixel is left, whatever is not missed."""
+    wide = widened(case, scale=3 * float(case.scale()) / case.scene.camera.width)
+    sight = wide.seen(case.image, budget)
+    low, high = (float(side[0, 0]) for side in offsets_at_crossings(sight))
+    lowest = np.flatnonzero(sight.borders.crossed[0, :, 0])[-1 - budget]
+    flat = 1 if budget else 0  # a row that may be spoiled leaves the border to the other one, which may hold two pixels
+    assert high - low <= (1 + flat + 1e-4) / sight.borders.ratio[0][lowest, 0]
+
+
+@examples(60)
+@given(case=whole_markings(), budget=st.integers(0, 3))
+def test_a_marking_ends_no_more_rows_beyond_the_lit_ones_than_may_be_missed(case: Case, budget: int) -> None:
+    wide = widened(case, z=0.2 * case.scene.runway.markings[0].length_m)
+    assume((wide.sets.z[0, 0] + case.scene.runway.ends_z_m).min() > 0)
+    closer = contract_by_ends(wide.sets, wide.seen(case.image, budget))
+    first, last = lit_rows(case)
+    camera, (near_z, far_z) = case.scene.camera, case.scene.runway.ends_z_m[0]
+    assert end_rows(camera, closer, near_z)[1][0] <= last + 1 + budget + 1e-4
+    assert end_rows(camera, closer, far_z)[0][0] >= first - budget - 1e-4
+
+
+@examples(60)
+@given(case=whole_markings())
+def test_claimed_pixels_pull_the_ends_out_to_their_rows(case: Case) -> None:
+    """Theorem B with nothing else lit: the near end reaches the last lit row, the far end the first."""
+    wide = widened(case, z=0.2 * case.scene.runway.markings[0].length_m)
+    assume((wide.sets.z[0, 0] + case.scene.runway.ends_z_m).min() > 0)
+    closer = contract_by_claims(wide.sets, wide.seen(case.image, 0, 0))
+    first, last = lit_rows(case)
+    camera, (near_z, far_z) = case.scene.camera, case.scene.runway.ends_z_m[0]
+    assert end_rows(camera, closer, near_z)[0][0] >= last - 1e-4
+    assert end_rows(camera, closer, far_z)[1][0] <= first + 1 + 1e-4
+
+
+@examples(60)
+@given(case=whole_markings(), name=st.sampled_from(["end pixels", "claims"]))
+def test_lit_pixels_tell_an_offset_to_their_columns(case: Case, name: str) -> None:
+    """Of the end's row, one pixel or two; of claimed pixels, the smallest pixel of all."""
+    wide = widened(case, scale=3 * float(case.scale()) / case.scene.camera.width)
+    sight = wide.seen(case.image, 0, 0 if name == "claims" else -1)
+    low, high = (float(side[0, 0]) for side in SOURCES[name](wide.sets, sight))
+    lowest = np.flatnonzero(sight.borders.crossed[0, :, 0])[-1]
+    assert high - low <= (2 + 0.1) / sight.borders.ratio[0][lowest, 0]
+
+
+@examples(60)
+@given(case=whole_markings())
+def test_offsets_tell_the_scale_and_the_track(case: Case) -> None:
+    """Offset over (p_x - x) is the scale, and p_x less offset over scale is x: no more is left than the sources leave."""
+    for axis, extent in (("scale", 0.1 * float(case.scale())), ("x", 10 / float(case.scale()))):
+        wide = widened(case, **{axis: extent})
+        sight = wide.seen(case.image, 0)
+        bounds = [SOURCES[name](wide.sets, sight) for name in ("crossings", "end pixels")]
+        low, high = max(low[0, 0] for low, _ in bounds), min(high[0, 0] for _, high in bounds)
+        across, scale = case.scene.runway.x_m[0] - float(case.state.x), float(case.scale())
+        found = getattr(contract_by_offsets(wide.sets, sight), axis)[0]
+        left = (high - low) / (abs(across) if axis == "scale" else scale)
+        assert found[1] - found[0] <= left + 1e-5 * extent
+
+
+@examples(60)
+@given(case=whole_markings())
+def test_altitude_and_scale_tell_each_other(case: Case) -> None:
+    for axis in ("y", "scale"):
+        wide = widened(case, **{axis: 0.1 * getattr(case.sets, axis)[0, 0]})
+        low, high = getattr(contract_by_altitude(case.scene.camera, wide.sets), axis)[0]
+        assert high - low <= 1e-9 * high
+
+
+# --- what the contractors share, against naive twins ---
+
+
+@given(seed=st.integers(0, 10_000), most=st.integers(0, 4), shape=st.tuples(st.integers(1, 3), st.integers(1, 6), st.integers(1, 5)))
+def test_relaxed_intersection_is_that_of_all_choices(seed: int, most: int, shape: tuple[int, int, int]) -> None:
+    """The largest lower and the smallest upper bound but for so many, by sorting each."""
+    rng = np.random.default_rng(seed)
+    low, high = rng.integers(-9, 9, (2, *shape)).astype(float)
+    spoiled_by = rng.integers(0, most + 1, shape[2])
+    found = relaxed_intersection(low.copy(), high.copy(), spoiled_by, most)
+    for marking, number in itertools.product(range(shape[0]), range(shape[2])):
+        count = int(spoiled_by[number])
+        lower = sorted(low[marking, :, number], reverse=True)
+        upper = sorted(high[marking, :, number])
+        assert found[0][marking, number] == (lower[count] if count < len(lower) else -np.inf)
+        assert found[1][marking, number] == (upper[count] if count < len(upper) else np.inf)
+
+
+@given(seed=st.integers(0, 10_000), budget=st.integers(0, 3), markings=st.integers(1, 3), dark_share=st.floats(0, 1))
+def test_missed_pixels_are_counted_by_disjoint_dark_windows(seed: int, budget: int, markings: int, dark_share: float) -> None:
+    """One row of one set, windows of one to four columns: never more than the largest disjoint choice, found by trying all."""
+    rng = np.random.default_rng(seed)
+    first = rng.integers(0, 14, (2, markings, 1, 1)).astype(float)
+    halves = first, first + rng.integers(0, 4, first.shape).astype(float)
+    rows = halves[0].min(axis=0), halves[1].max(axis=0)
+    dark, crossed = rng.random((2, *first.shape)) < np.array([dark_share, 0.8]).reshape(2, 1, 1, 1, 1)
+    frame = np.zeros(first.shape)
+    count = Missed.count(budget, LitColumns(halves, frame, frame, dark), crossed, LitColumns(rows, frame[0], frame[0], dark.all(axis=0)))
+    charged = [
+        (low, high)
+        for low, high, is_charged in zip(*(side.ravel() for side in halves), (dark & crossed).ravel(), strict=True)
+        if is_charged
+    ]
+    largest = max(
+        size
+        for size in range(len(charged) + 1)
+        for chosen in itertools.combinations(charged, size)
+        if all(one[1] < other[0] or other[1] < one[0] for one, other in itertools.combinations(chosen, 2))
+    )
+    left = int(count.left[0])
+    if budget > 0:
+        assert left >= budget - largest
+        assert left < budget or not charged
+        meets = [
+            any(low <= one[1] and one[0] <= high for one in charged) for low, high in zip(*(side.ravel() for side in halves), strict=True)
+        ]
+        assert count.halves.ravel().tolist() == meets
+        in_row = [
+            any(low <= one[1] and one[0] <= high for one in charged) for low, high in zip(*(side.ravel() for side in rows), strict=True)
+        ]
+        assert count.rows.ravel().tolist() == in_row
+    else:
+        assert (left < 0) == bool(charged)
