@@ -21,12 +21,13 @@ from runtime.refine.slices import rereferenced, tangent_below_horizon
 from runtime.rounding import lowered, raised
 from runtime.scene import Camera, Scene
 from runtime.state_set import StateSet
+from runtime.turn import cosine_and_sine
 
 Floats = NDArray[np.float64]
 
 US_PER_S = 1e6
-PEAK_RAD = 1e-9
-"""How near to straight down an angle counts as there: far above float64's error, and sound to either side."""
+FLAT = 1e-9
+"""A slope in delta of no more than so much of its terms counts as both up and down: far above float64's error, and sound either way."""
 
 
 @dataclass(frozen=True)
@@ -109,25 +110,31 @@ def moved(camera: Camera, sets: StateSet, by: Displacement, domain: Box) -> Stat
 
 
 def _moved_scale(sets: StateSet, theta: Floats, y: Floats, by: Displacement) -> Floats:
-    """The scales of sets whose pitch and altitude have moved into `theta` and `y`, (sets, 2) each, rounded outward.
-
-    The turn sin(psi + delta)/sin(psi) = cos(delta) + sin(delta) cot(psi) is monotone in psi, and concave in delta where it is above 0: its
-    extremes are at the corners, or, as the largest, 1/sin(psi) where psi + delta = pi/2. And y/(y + epsilon) = 1 - epsilon/y'.
-    """
-    delta = _differences(sets.theta, theta, by.lower[0], by.upper[0])[:, None, :]
-    cosine, sine = sets.turn
-    cotangent = ((cosine - sets.tangent[:, None] * sine) / sets.reference_fall)[:, :, None]
-    turns, terms = np.cos(delta) + np.sin(delta) * cotangent, 1 + np.abs(np.sin(delta) * cotangent) * sets.condition[:, None, None]
-    slow, fast = lowered(turns, terms).min(axis=(1, 2)), raised(turns, terms).max(axis=(1, 2))
-    psi = np.arctan(sets.tangent)[:, None] + sets.theta
-    peaks = (psi + delta[..., 0] <= np.pi / 2 + PEAK_RAD) & (np.pi / 2 - PEAK_RAD <= psi + delta[..., 1])
-    peak = np.where(peaks, np.sqrt(1 + sets.tangent**2)[:, None] / sets.reference_fall, 0).max(axis=1)
-    fast = np.maximum(fast, raised(peak, peak * sets.condition))
+    """The scales of sets whose pitch and altitude have moved into `theta` and `y`, (sets, 2) each, rounded outward."""
+    slow, fast = _turn(sets, _differences(sets.theta, theta, by.lower[0], by.upper[0]))
     falls = _differences(sets.y, y, by.lower[2], by.upper[2])[:, None, :] / y[:, :, None]
-    shrinks, terms = 1 - falls, 1 + np.abs(falls)
-    low = sets.scale[:, 0] * np.maximum(slow, 0) * np.maximum(lowered(shrinks, terms).min(axis=(1, 2)), 0)
+    shrinks, terms = 1 - falls, 1 + np.abs(falls)  # y/(y + epsilon) = 1 - epsilon/y'
+    low = sets.scale[:, 0] * slow * np.maximum(lowered(shrinks, terms).min(axis=(1, 2)), 0)
     high = sets.scale[:, 1] * fast * raised(shrinks, terms).max(axis=(1, 2))
     return np.stack([lowered(low, low), raised(high, high)], axis=-1)
+
+
+def _turn(sets: StateSet, delta: Floats) -> tuple[Floats, Floats]:
+    """Range of sin(psi + delta)/sin(psi) = cos(delta) + sin(delta) cot(psi), (sets,) each, where it is above 0; `delta` is (sets, 2).
+
+    It is monotone in psi, and concave in delta where it is above 0: its extremes are at the corners, or, as the largest, 1/sin(psi) where
+    psi + delta = pi/2. Of turns by more than a right angle nothing is said.
+    """
+    (cosine, sine), (cos_delta, sin_delta) = sets.turn, (side[:, None] for side in cosine_and_sine(delta))
+    cotangent = ((cosine - sets.tangent[:, None] * sine) / sets.reference_fall)[:, :, None]
+    turns, terms = cos_delta + sin_delta * cotangent, 1 + np.abs(sin_delta * cotangent) * sets.condition[:, None, None]
+    slow, fast = np.maximum(lowered(turns, terms).min(axis=(1, 2)), 0), raised(turns, terms).max(axis=(1, 2))
+    slopes = cos_delta * cotangent - sin_delta
+    peaks = (slopes[..., 0] >= -FLAT * terms[..., 0]) & (slopes[..., 1] <= FLAT * terms[..., 1])
+    peak = np.where(peaks, np.sqrt(1 + sets.tangent**2)[:, None] / sets.reference_fall, 0).max(axis=1)
+    fast = np.maximum(fast, raised(peak, peak * sets.condition))
+    beyond = np.abs(delta).max(axis=1) > np.pi / 2
+    return np.where(beyond, 0, slow), np.where(beyond, np.inf, fast)
 
 
 def _differences(before: Floats, after: Floats, low: float, high: float) -> Floats:

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from runtime.estimate import Box
 from runtime.model.limits import BELOW_HORIZON_PX
 from runtime.refine.altitude import contract_by_altitude
-from runtime.rounding import OUTWARD_RELATIVE, lowered, raised
+from runtime.rounding import lowered, raised
 from runtime.scene import Camera
-from runtime.state_set import StateSet, scale_range, scale_ratio, tangent_of_row
+from runtime.state_set import StateSet, scale_ratio, tangent_of_row
+from runtime.turn import cosine_and_sine
 
 Floats = NDArray[np.float64]
 
@@ -33,14 +34,14 @@ def covering(camera: Camera, box: Box, row: float) -> StateSet:
     """One set that holds all states of the box; the row its scale refers to is `row`, or lower where that is too near the horizon."""
     theta, x, y, z = (np.array([[low, high]]) for low, high in zip(box.lower, box.upper, strict=True))
     tangent = np.array([tangent_below_horizon(camera, float(tangent_of_row(camera, row)), box.lower[0])])
-    low, high = scale_range(camera, theta, y, tangent)
-    scale = np.stack([low * (1 - OUTWARD_RELATIVE), high * (1 + OUTWARD_RELATIVE)], axis=-1)
-    return StateSet(theta, x, y, z, scale, tangent)
+    sets = StateSet(theta, x, y, z, np.array([[0.0, np.inf]]), tangent)
+    return contract_by_altitude(camera, sets)
 
 
 def tangent_below_horizon(camera: Camera, tangent: float, theta_low: float) -> float:
     """The tangent of a row, or of a lower one that is `BELOW_HORIZON_PX` below the horizon of every theta from `theta_low` on."""
-    return max(tangent, BELOW_HORIZON_PX / camera.focal_px - float(np.tan(theta_low)))
+    cosine, sine = cosine_and_sine(np.array([[theta_low]]))
+    return max(tangent, float(BELOW_HORIZON_PX / camera.focal_px - sine[0, 0] / cosine[0, 0]))
 
 
 def rereferenced(sets: StateSet, tangent: Floats) -> StateSet:
