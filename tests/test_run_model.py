@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,14 +23,16 @@ import replay
 import typer
 from typer.testing import CliRunner, Result
 
-from runtime import Estimator
+from runtime import Box, Estimator, Motion
 from runtime.explanation import missed_pixels
 from runtime.frames import FrameStream
 from runtime.image import runway_image
+from runtime.recordings.attitude import COLUMNS as ATTITUDE_COLUMNS
+from runtime.recordings.attitude import AttitudeReadings
 from runtime.recordings.cli import run_model
 from runtime.recordings.history import MOST_MOMENTS, History, Moment, draw_history
 from runtime.recordings.recording import EVENT
-from runtime.recordings.report import COLUMNS, TRUTH_COLUMNS
+from runtime.recordings.report import COLUMNS, TRACKED_COLUMNS, TRACKED_INSIDE, TRUTH_COLUMNS
 from runtime.recordings.truth import Truth, TruthError
 from runtime.recordings.video import is_whole
 
@@ -304,7 +307,7 @@ def test_a_truth_that_no_window_lies_within_is_told_with_both_ranges(recording, 
     np.savetxt(tmp_path / "t.csv", rows, delimiter=",", header="time_us,theta_rad,x_m,y_m,z_m", comments="", fmt=["%d", *["%.17g"] * 4])
     done = invoke(MODEL, recording, "-o", tmp_path / "out", "--no-video", "--truth", tmp_path / "t.csv")
     assert done.exit_code == 2
-    for part in ("t.csv: no window's middle lies within its times, 1000000.000000 to 1000000.960000 s", "0.020000 to 0.980000 s"):
+    for part in ("t.csv: no window's instant lies within its times, 1000000.000000 to 1000000.960000 s", "0.020000 to 0.980000 s"):
         assert part in done.stderr
     assert done.stderr.count("\n") == 1
     assert len(rows_of(tmp_path / "out")) == WINDOWS
@@ -505,3 +508,120 @@ def test_a_live_estimator_gives_what_the_windows_give(events, estimator):
     for (_, estimate), (_, frame) in zip(got, windows, strict=True):
         np.testing.assert_array_equal(estimate.filtered, estimator.estimate(frame).filtered)
     assert "certified" in replay.line_of(*got[0], 1.0)
+
+
+# --- certified tracking ---
+
+MOTION = "0.2,0,0.3,0.3"
+"""The flight's own rates are 0.19 rad/s, 0.21 m/s and 0.19 m/s."""
+
+
+def attitude_file(path: Path, bias: float) -> Path:
+    """Readings every 10 ms, nose up by -theta, off by `bias`, with a plus-minus of 0.005 rad."""
+    times = np.arange(0, 1_000_001, 10_000)
+    theta = np.interp(times, 40_000 * np.arange(WINDOWS) + 20_000, STATES[:, 0])
+    columns = [times, 0 * times, -theta + bias, 0 * times, 0 * times, 0 * times + 0.005, 0 * times]
+    header = "time_us,roll_rad,pitch_rad,yaw_rad,roll_plus_minus_rad,pitch_plus_minus_rad,yaw_plus_minus_rad"
+    np.savetxt(path, np.column_stack(columns), delimiter=",", header=header, comments="")
+    return path
+
+
+def widths(rows: list[dict[str, str]], prefix: str) -> NDArray:
+    """Widths of theta's certified interval in all windows but the one without a runway."""
+    seen = [row for number, row in enumerate(rows) if number != 7]
+    return np.array([float(row[f"{prefix}upper_theta_rad"]) - float(row[f"{prefix}lower_theta_rad"]) for row in seen])
+
+
+def test_windows_are_certified_over_time_too(recording, truth, tmp_path):
+    done = invoke(MODEL, recording, "-o", tmp_path, "--truth", truth, "--no-video", "--track", "--motion", MOTION)
+    assert (done.exit_code, done.stderr) == (0, "")
+    rows, summary = rows_of(tmp_path), json.loads((tmp_path / "summary.json").read_text())
+    assert list(rows[0]) == [*COLUMNS, *TRUTH_COLUMNS, *TRACKED_COLUMNS, TRACKED_INSIDE]
+    assert [int(row["instant_us"]) for row in rows] == [40_000 * number + 20_000 for number in range(WINDOWS)]
+    assert [row["tracked_outcome"] for row in rows] == ["no runway" if number == 7 else "certified" for number in range(WINDOWS)]
+    assert [row["tracked_truth_inside"] for row in rows] == ["0" if number == 7 else "1" for number in range(WINDOWS)]
+    assert (widths(rows, "tracked_") <= widths(rows, "") * 1.2).all()
+    assert np.median(widths(rows, "tracked_")) < 0.9 * np.median(widths(rows, ""))
+    assert (summary["tracked"]["certified"], summary["tracked"]["inside"]) == (WINDOWS - 1, WINDOWS - 1)
+    assert "over time" in done.stdout
+    assert "the state moves by theta -0.2 to 0.2 rad/s" in " ".join(done.stdout.split())
+
+
+def test_an_attitude_reference_makes_the_box_smaller_and_a_wrong_one_is_found(recording, truth, tmp_path):
+    options = (MODEL, recording, "-o", tmp_path, "--truth", truth, "--no-video", "--track", "--motion", MOTION)
+    assert invoke(*options, "--attitude", attitude_file(tmp_path / "good.csv", 0.004)).exit_code == 0
+    rows = rows_of(tmp_path)
+    assert (widths(rows, "tracked_") <= 0.012 + 0.2 * 0.02).all()
+    assert [row["tracked_truth_inside"] for row in rows] == ["0" if number == 7 else "1" for number in range(WINDOWS)]
+    assert invoke(*options, "--attitude", attitude_file(tmp_path / "bad.csv", 0.06)).exit_code == 0
+    assert {row["tracked_outcome"] for row in rows_of(tmp_path)} == {"inconsistent", "no runway"}
+    done = invoke(*options, "--horizon", 5, "--outliers", 1)
+    assert done.exit_code == 0
+    assert [row["tracked_truth_inside"] for row in rows_of(tmp_path)] == ["1"] * WINDOWS
+    assert "of any 5 windows all but 1 at most keep these assumptions" in " ".join(done.stdout.split())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--track"], "--track: the model's scene has no [motion]; give --motion, the largest rates of theta, x, y, z"),
+        (["--motion", MOTION], f"--motion: found {MOTION} without --track; add --track, or leave it out"),
+        (["--track", "--motion", "1,2"], "--motion: found '1,2'; give four numbers from 0 on, as 0.1,0,0.3,1 (rad/s and m/s)"),
+        (["--track", "--motion", "-1,0,0,0"], "--motion: found '-1,0,0,0'; give four numbers from 0 on, as 0.1,0,0.3,1 (rad/s and m/s)"),
+        (["--track", "--motion", MOTION, "--outliers", "1"], "--outliers: found 1 with a horizon of None; give 0, or fewer than "),
+        (["--track", "--motion", MOTION, "--horizon", "0"], "--horizon: found 0; give 1 frame or more, or None"),
+    ],
+)
+def test_tracking_that_cannot_be_done_is_refused(recording, tmp_path, options, message):
+    done = invoke(MODEL, recording, "-o", tmp_path / "out", *options)
+    assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
+    assert done.stderr.startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("time_us,roll_rad\n1,2\n", "'pitch_rad' is not in list"),
+        (None, "No such file"),
+        ("{header}\n1,0,0,0,0,-1,0\n", "found 1 lines, times that do not ascend, numbers that are not finite, or a plus-minus below 0"),
+        ("{header}\n1,0,0,0,0,0,0\n1,0,0,0,0,0,0\n", "found 2 lines, times that do not ascend"),
+        ("{header}\n", "found 0 lines"),
+    ],
+)
+def test_attitudes_that_cannot_be_used_are_refused(recording, tmp_path, text, found):
+    path = tmp_path / "attitude.csv"
+    if text is not None:
+        path.write_text(text.format(header=",".join(ATTITUDE_COLUMNS)))
+    done = invoke(MODEL, recording, "-o", tmp_path / "out", "--track", "--motion", MOTION, "--attitude", path)
+    assert (done.exit_code, done.stderr.count("\n")) == (2, 1)
+    assert done.stderr.startswith(f"{path}: ")
+    assert found in done.stderr
+
+
+def test_readings_are_moved_to_the_instant_between_them(tmp_path):
+    readings = AttitudeReadings.load(attitude_file(tmp_path / "a.csv", 0.0))
+    estimator = Estimator.load(MODEL)
+    motion, nose_down = Motion([-0.1] * 4, [0.1] * 4), STATES[0, 0]
+    for time_us, widening in ((0, 0.0), (4_000, 0.0006), (10_000, 0.0), (-1_000_000, 0.1)):
+        box = readings.prior(time_us, motion, estimator.domain)
+        assert box.lower[0] == pytest.approx(nose_down - 0.005 - widening, abs=1e-9)
+        assert box.upper[0] == pytest.approx(nose_down + 0.005 + widening, abs=1e-9)
+        assert box.lower[1:].tolist() == estimator.domain.lower[1:].tolist()
+    unknown = readings.prior(5_000, Motion([-np.inf] * 4, [np.inf] * 4), estimator.domain)
+    assert (unknown.lower[0], unknown.upper[0]) == (estimator.domain.lower[0], estimator.domain.upper[0])
+    assert readings.level(0.0, 0.0)
+
+
+def test_the_chart_shows_both_bands():
+    scene, history = Estimator.load(MODEL).scene, History()
+    for number, state in enumerate(STATES):
+        box = Box(state - 0.01, state + 0.01)
+        history.add(Moment(number, number + 1, state, state - 0.05, state + 0.05, state, None if number == 3 else box))
+    with_both = draw_history(scene, history)
+    plain = History()
+    for moment in history.moments:
+        plain.add(replace(moment, tracked=None))
+    assert (with_both != draw_history(scene, plain)).mean() > 0.01
+    joined = history.moments[2].joined(history.moments[3]).tracked
+    assert joined is not None
+    assert joined.lower.tolist() == (STATES[2] - 0.01).tolist()

@@ -26,6 +26,7 @@ try:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
     from rich.table import Table
 
+    from runtime.recordings.attitude import AttitudeError
     from runtime.recordings.bench import (
         REFERENCE,
         THROUGHPUT_CLUTTER,
@@ -38,6 +39,7 @@ try:
         throughput,
     )
     from runtime.recordings.draw import png
+    from runtime.recordings.follower import Follower, TrackingError
     from runtime.recordings.latency_chart import latency_chart
     from runtime.recordings.noted import lines_of, noted_of
     from runtime.recordings.recording import Notes, RecordingError, read_events
@@ -61,6 +63,11 @@ def run_model(
     truth: Annotated[Path | None, typer.Option(help="CSV: time_us, theta_rad, x_m, y_m, z_m. Judges every window.")] = None,
     video: Annotated[bool, typer.Option("--video/--no-video", help="Write overlay.mp4.")] = True,
     refine: Annotated[bool, typer.Option("--refine/--no-refine", help="Contract the passing entries: tighter and slower.")] = True,
+    track: Annotated[bool, typer.Option("--track", help="Certify over time too: each frame within what those before leave.")] = False,
+    motion: Annotated[str | None, typer.Option(help="Largest rates of theta, x, y, z, as 0.1,0,0.3,1; by default the scene's.")] = None,
+    attitude: Annotated[Path | None, typer.Option(help="CSV of an attitude reference, whose pitch --track takes for known.")] = None,
+    horizon: Annotated[int | None, typer.Option(help="With --track: a box rests on the last so many windows alone.")] = None,
+    outliers: Annotated[int, typer.Option(help="With --horizon: windows of it that may break their assumptions.")] = 0,
 ) -> None:
     """Take a recording to states and certified boxes: estimates.csv, summary.json, pictures and a video.
 
@@ -76,14 +83,17 @@ def run_model(
         gap_us, notes = _microseconds(largest_gap_ms), Notes()
         stream = FrameStream(estimator.scene.camera.shape, _microseconds(window_ms), step_us, largest_gap_us=gap_us)
         known = None if truth is None else Truth.load(truth)
+        follower = Follower.of(estimator, attitude, motion, horizon, outliers) if track else None
+        _demand_track(track, {"--motion": motion, "--attitude": attitude, "--horizon": horizon, "--outliers": outliers or None})
         packets = _nonempty(recording, read_events(recording, estimator.scene.camera.shape, notes))
-        inputs = [path for path in (model, recording, truth) if path is not None]
-        with Report(folder, estimator, stream.window_us, stream.step_us, known, video=video, inputs=inputs) as report:
-            fault, code = _estimated(console, stream, packets, report, refine)
+        inputs = [path for path in (model, recording, truth, attitude) if path is not None]
+        with Report(folder, estimator, stream.window_us, stream.step_us, known, video=video, tracked=track, inputs=inputs) as report:
+            fault, code = _estimated(console, stream, packets, report, refine, follower)
             noted = noted_of(stream, notes)
             source = {"model": str(model), "sha256": estimator.sha256, "recording": str(recording), "fault": fault}
+            source |= {} if follower is None else {"tracking": follower.description}
             summary = report.close({**source, "window_us": stream.window_us, "step_us": stream.step_us, **noted})
-    except (ModelError, EventError, RecordingError, TruthError, OutputError) as error:
+    except (ModelError, EventError, RecordingError, TruthError, AttitudeError, TrackingError, OutputError) as error:
         fail(error)
     except OSError as error:
         fail(f"{recording}: cannot be read ({error.strerror or error}); give the path of a recording that can")
@@ -99,25 +109,32 @@ def run_model(
 
 
 def _estimated(
-    console: Console, stream: FrameStream, packets: Iterator[NDArray[Any]], report: Report, refine: bool
+    console: Console, stream: FrameStream, packets: Iterator[NDArray[Any]], report: Report, refine: bool, follower: Follower | None
 ) -> tuple[str | None, int]:
     """Every window into the report; what ended them early, if something did, and the exit code for it."""
     try:
         with _progress(console) as bar:
-            _estimate_all(stream, packets, report, refine, bar)
+            _estimate_all(stream, packets, report, refine, follower, bar)
     except KeyboardInterrupt:
         return "interrupted", INTERRUPTED
     except (RecordingError, EventError, OSError) as error:
         # What came before the fault is whole: its last windows are estimated as well.
-        _estimate_all(stream, iter(()), report, refine, None)
+        _estimate_all(stream, iter(()), report, refine, follower, None)
         return str(error), DAMAGED
     return None, 0
 
 
+def _demand_track(track: bool, options: dict[str, object]) -> None:
+    """Raises `TrackingError` for an option that says nothing without --track."""
+    for name, value in options.items():
+        if value is not None and not track:
+            raise TrackingError(f"{name}: found {value} without --track; add --track, or leave it out")
+
+
 def _unmatched(path: Path, truth: Truth, summary: dict[str, Any]) -> str:
     """What to say of a truth that judges no window."""
-    known, seen = _seconds((truth.time_us[0], truth.time_us[-1])), _seconds(summary["window_middles_us"])
-    return f"{path}: no window's middle lies within its times, {known}; they run from {seen}; give time_us on the recording's own clock"
+    known, seen = _seconds((truth.time_us[0], truth.time_us[-1])), _seconds(summary["window_instants_us"])
+    return f"{path}: no window's instant lies within its times, {known}; they run from {seen}; give time_us on the recording's own clock"
 
 
 def _seconds(range_us: tuple[float, float] | None) -> str:
@@ -141,14 +158,18 @@ def _progress(console: Console) -> Progress:
     return Progress(texts[0], BarColumn(), texts[1], TimeElapsedColumn(), console=console, transient=True, disable=not console.is_terminal)
 
 
-def _estimate_all(stream: FrameStream, packets: Iterator[NDArray[Any]], report: Report, refine: bool, bar: Progress | None) -> None:
+def _estimate_all(
+    stream: FrameStream, packets: Iterator[NDArray[Any]], report: Report, refine: bool, follower: Follower | None, bar: Progress | None
+) -> None:
     """Every window of the packets into the report."""
     task = None if bar is None else bar.add_task("windows", total=None, seconds=0.0)
     seconds = 0.0
     for start_us, frame in stream.frames(packets):
         begun = time.perf_counter()
         estimate = report.estimator.estimate(frame, refine=refine)
-        report.add(start_us, frame, estimate, 1000 * (time.perf_counter() - begun))
+        milliseconds = 1000 * (time.perf_counter() - begun)
+        tracked = None if follower is None else follower.update(frame, start_us + report.instant_us)
+        report.add(start_us, frame, estimate, milliseconds, tracked)
         if bar is not None and task is not None:
             seconds += stream.step_us / 1e6
             bar.update(task, advance=1, seconds=seconds)
@@ -170,6 +191,7 @@ def _print_summary(console: Console, folder: Path, summary: dict[str, Any]) -> N
         "half-widths, mean": half_widths if summary["certified"] else "-",
         "ms a window, mean / largest": "{mean:.2f} / {largest:.2f}".format(**summary["milliseconds_a_window"]),
     }
+    rows |= _tracked(summary.get("tracked"))
     for kind, name in (("assumptions_hold", "assumptions hold"), ("assumptions_broken", "assumptions broken")):
         if kind in summary:
             rows |= _judged(name, summary[kind])
@@ -177,8 +199,19 @@ def _print_summary(console: Console, folder: Path, summary: dict[str, Any]) -> N
         table.add_row(name, str(value))
     console.print(table)
     console.print("The certificate assumes:")
-    for line in summary["assumptions"]:
+    for line in [*summary["assumptions"], *summary.get("tracking", [])]:
         console.print(f"  - {line}", highlight=False)
+
+
+def _tracked(followed: dict[str, Any] | None) -> dict[str, str]:
+    """Rows on what a tracker made of the windows."""
+    if followed is None:
+        return {}
+    counts = ", ".join(f"{count} {name}" for name, count in followed.items() if name not in ("mean_half_widths", "inside", "outside"))
+    if "inside" in followed or "outside" in followed:
+        counts += f"; truth inside {followed.get('inside', 0)}, outside {followed.get('outside', 0)}"
+    half_widths = ", ".join(f"{name} {value:.4f}" for name, value in followed["mean_half_widths"].items())
+    return {"over time": counts, "over time: half-widths, mean": half_widths}
 
 
 def _explained(lacking: dict[str, Any] | None) -> dict[str, str]:

@@ -1,6 +1,6 @@
 """States against time: what a history keeps of a recording of any length, and its chart.
 
-The chart has the colours of `runtime.recordings.draw`: amber for the certified band, magenta for the estimate, white for the truth, red
+The chart has the colours of `runtime.recordings.draw`: amber for the certified bands, magenta for the estimate, white for the truth, red
 for times at which nothing is certified.
 """
 
@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from runtime.estimate import Box
 from runtime.recordings.chart import FONT_PT, new_figure, picture_of, rgb, style_axes
 from runtime.recordings.draw import BACKGROUND, FRAME_BORDER, NO_RUNWAY, STATE, TEXT, TRUTH, Picture
 from runtime.scene import STATE_NAMES, STATE_UNITS, Scene
@@ -27,6 +28,8 @@ MARGIN = 0.2
 """What a panel shows above and below the domain, as a share of the domain's width."""
 BAND = (0, 85, 130)
 """Amber as it looks over the background."""
+TRACKED = (60, 175, 240)
+"""Lighter amber: what is certified over time, within the band of the frame alone."""
 MARK_HEIGHT = 0.05
 """Height of the mark where nothing is certified, at the foot of a panel, as a share of the panel's."""
 
@@ -41,14 +44,18 @@ class Moment:
     lower: NDArray[np.float64] | None
     upper: NDArray[np.float64] | None
     truth: NDArray[np.float64] | None
+    tracked: Box | None = None
+    """Certified over time (`runtime.tracker`)."""
 
     def joined(self, later: Moment) -> Moment:
         """Both as one: the hull of their bounds, the later states; uncertified only if neither is certified."""
         bounds = [(moment.lower, moment.upper) for moment in (self, later) if moment.lower is not None and moment.upper is not None]
         lower = np.min([low for low, _ in bounds], axis=0) if bounds else None
         upper = np.max([high for _, high in bounds], axis=0) if bounds else None
+        boxes = [moment.tracked for moment in (self, later) if moment.tracked is not None]
+        tracked = Box(np.min([box.lower for box in boxes], axis=0), np.max([box.upper for box in boxes], axis=0)) if boxes else None
         state, truth = (old if new is None else new for old, new in ((self.state, later.state), (self.truth, later.truth)))
-        return Moment(self.start_us, later.stop_us, state, lower, upper, truth)
+        return Moment(self.start_us, later.stop_us, state, lower, upper, truth, tracked)
 
 
 class History:
@@ -96,8 +103,10 @@ def draw_history(scene: Scene, history: History, width: int = WIDTH_PX) -> Pictu
 
 def _legend(moments: Sequence[Moment]) -> list[tuple[str, tuple[int, int, int]]]:
     """Names and colours of what the moments have."""
+    followed = any(moment.tracked is not None for moment in moments)
     present = {
-        ("certified band", BAND): any(moment.lower is not None for moment in moments),
+        ("certified by the frame alone" if followed else "certified band", BAND): any(moment.lower is not None for moment in moments),
+        ("certified over time", TRACKED): followed,
         ("estimate", STATE): any(moment.state is not None for moment in moments),
         ("truth", TRUTH): any(moment.truth is not None for moment in moments),
         ("no runway", NO_RUNWAY): any(moment.lower is None for moment in moments),
@@ -121,6 +130,10 @@ def _draw_panel(panel: Axes, moments: Sequence[Moment], axis: int, low: float, h
     panel.set(xlim=(times[0], times[-1]), ylim=(low - margin, high + margin), yticks=[low, (low + high) / 2, high])
     panel.hlines([low, high], times[0], times[-1], colors=[rgb(FRAME_BORDER)], linewidth=0.8)
     panel.fill_between(times, *ends, color=rgb(BAND), linewidth=0)
+    tracked = np.array(
+        [[np.nan] * 2 if box is None else [box.lower[axis], box.upper[axis]] for box in (moment.tracked for moment in moments)]
+    )
+    panel.fill_between(times, *tracked.T.repeat(2, axis=1), color=rgb(TRACKED), linewidth=0)
     none = np.isnan(lower).repeat(2)
     panel.fill_between(times, 0, MARK_HEIGHT, where=none.tolist(), transform=panel.get_xaxis_transform(), color=rgb(NO_RUNWAY), linewidth=0)
     for values, colour in ((state, STATE), (truth, TRUTH)):

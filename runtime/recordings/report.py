@@ -48,7 +48,13 @@ TRUTH_COLUMNS = [
     *(*(f"truth_{name}" for name in STATE_COLUMNS), "missed", "dark_rows", "assumptions_hold", "truth_inside"),
     *(f"error_{name}" for name in STATE_COLUMNS),
 ]
-"""With a truth: the state at the window's middle, and how the window fares against it (`runtime.recordings.truth.Judgement`)."""
+"""With a truth: the state at the window's instant, and how the window fares against it (`runtime.recordings.truth.Judgement`)."""
+TRACKED_COLUMNS = [
+    *("instant_us", "tracked_outcome", *(f"tracked_{name}" for name in STATE_COLUMNS)),
+    *(f"tracked_{side}_{name}" for side in ("lower", "upper") for name in STATE_COLUMNS),
+]
+"""With a tracker: the instant that the certificate speaks of, and outcome, state and box over time; with a truth, whether it is inside."""
+TRACKED_INSIDE = "tracked_truth_inside"
 TABLE, SUMMARY, VIDEO = "estimates.csv", "summary.json", "overlay.mp4"
 PICTURE_NAME = re.compile(r"overlay_\d{6,}\.png")
 MOST_PICTURES = 12
@@ -69,19 +75,23 @@ class Report:
         truth: Truth | None,
         *,
         video: bool,
+        tracked: bool = False,
         inputs: Iterable[Path] = (),
     ) -> None:
         self.folder, self.estimator, self.window_us, self.step_us, self.truth = folder, estimator, window_us, step_us, truth
+        self.instant_us = window_us * estimator.scene.instant_share
+        """From the start of a window to the instant that its certificate speaks of."""
+        self._tracked_columns = [*TRACKED_COLUMNS, *([TRACKED_INSIDE] if truth else [])] if tracked else []
         self.tally = Tally(estimator.missed_budget, estimator.largest_missed_budget)
         self._outputs = OutputFolder(folder, inputs)
         with writing(folder / TABLE):
             self._file = self._outputs.begin(TABLE).open("w", encoding="utf-8", newline="")
             self._rows = csv.writer(self._file, lineterminator="\n")
-            self._rows.writerow([*COLUMNS, *(TRUTH_COLUMNS if truth else [])])
+            self._rows.writerow([*COLUMNS, *(TRUTH_COLUMNS if truth else []), *self._tracked_columns])
         self._video = Video(self._outputs, VIDEO, step_us) if video else None
         self._history = History()
         self._to_draw: dict[int, Callable[[], Picture]] = {}
-        self._middles_us: tuple[float, float] | None = None
+        self._instants_us: tuple[float, float] | None = None
         self._picture_every = 1
 
     def __enter__(self) -> Report:
@@ -92,22 +102,35 @@ class Report:
             self._file.close()
         self._outputs.discard()
 
-    def add(self, start_us: int, frame: NDArray[np.uint8], estimate: Estimate, milliseconds: float) -> None:
-        """One window: its start, its frame, what the estimator made of it, and how long that took."""
+    def add(
+        self, start_us: int, frame: NDArray[np.uint8], estimate: Estimate, milliseconds: float, tracked: Estimate | None = None
+    ) -> None:
+        """One window: its start, its frame, what the estimator made of it, how long that took, and what a tracker made of it."""
         number = self.tally.counts["windows"]
-        middle_us = start_us + self.window_us / 2
-        earliest, latest = self._middles_us or (middle_us, middle_us)  # of all runs of a clock that went back, too
-        self._middles_us = min(earliest, middle_us), max(latest, middle_us)
-        state = self.truth.at(middle_us) if self.truth else None
+        instant_us = start_us + self.instant_us
+        earliest, latest = self._instants_us or (instant_us, instant_us)  # of all runs of a clock that went back, too
+        self._instants_us = min(earliest, instant_us), max(latest, instant_us)
+        state = self.truth.at(instant_us) if self.truth else None
         judgement = None if state is None else judge(self.estimator.scene, frame, estimate, state, self.estimator.missed_budget)
         explanation = None if estimate.certified else explain(self.estimator, frame, estimate)
         self.tally.add(estimate, milliseconds, judgement, explanation)
+        if tracked is not None:
+            self.tally.follow(tracked, state)
         row = [*_row(start_us, estimate, float(frame.mean()), milliseconds), *_explanation_row(explanation)]
         with writing(self.folder / TABLE):
-            self._rows.writerow([*row, *(_judgement_row(judgement) if self.truth else [])])
-        box = estimate.box
-        self._history.add(Moment(start_us, start_us + self.step_us, estimate.state, box and box.lower, box and box.upper, state))
+            row += [*(_judgement_row(judgement) if self.truth else []), *self._tracked_row(instant_us, tracked, state)]
+            self._rows.writerow(row)
+        box, followed = estimate.box, tracked and tracked.box
+        self._history.add(Moment(start_us, start_us + self.step_us, estimate.state, box and box.lower, box and box.upper, state, followed))
         self._draw(number, frame, estimate, {"truth": state, "explanation": explanation, "title": f"{start_us / 1e6:.3f} s"})
+
+    def _tracked_row(self, instant_us: float, tracked: Estimate | None, truth: NDArray[np.float64] | None) -> list[object]:
+        if tracked is None:
+            return [""] * len(self._tracked_columns)
+        inside = "" if truth is None else int(tracked.box is not None and tracked.box.contains(truth))
+        return [f"{instant_us:g}" if instant_us % 1 else int(instant_us), tracked.outcome.value, *_numbers(tracked), inside][
+            : len(self._tracked_columns)
+        ]
 
     def _draw(self, number: int, frame: NDArray[np.uint8], estimate: Estimate, shown: dict[str, Any]) -> None:
         """Draws the window if it is one for the video; keeps what a picture needs, as most are given up for later ones."""
@@ -134,7 +157,7 @@ class Report:
             self._outputs.write(f"overlay_{number:06d}.png", png(picture()))
         self._outputs.write("state.png", png(draw_history(self.estimator.scene, self._history)))
         names = [*self._outputs.names, SUMMARY]
-        extra = {**extra, "window_middles_us": self._middles_us}
+        extra = {**extra, "window_instants_us": self._instants_us}
         summary = {**extra, **self.tally.table(), "missed_budget": self.estimator.missed_budget, "assumptions": self._assumptions()}
         earlier = _files_of_report(self.folder)
         self._outputs.write(SUMMARY, json.dumps({**summary, "files": names}, indent=2).encode())
@@ -159,11 +182,15 @@ def _files_of_report(folder: Path) -> list[str]:
 
 
 def _row(start_us: int, estimate: Estimate, lit_share: float, milliseconds: float) -> list[object]:
-    sides = (None, None) if estimate.box is None else (estimate.box.lower, estimate.box.upper)
-    states = [number for state in (estimate.state, *sides) for number in ([""] * 4 if state is None else state.tolist())]
     flags = [int(estimate.used_fallback), int(estimate.touches_boundary)]
     counts = [estimate.cell, len(estimate.passing), len(estimate.regions), *flags, estimate.mismatch]
-    return [start_us, estimate.outcome.value, *states, *counts, f"{lit_share:.6f}", f"{milliseconds:.3f}"]
+    return [start_us, estimate.outcome.value, *_numbers(estimate), *counts, f"{lit_share:.6f}", f"{milliseconds:.3f}"]
+
+
+def _numbers(estimate: Estimate) -> list[object]:
+    """State, lower and upper bounds; empty where nothing is certified."""
+    sides = (None, None) if estimate.box is None else (estimate.box.lower, estimate.box.upper)
+    return [number for state in (estimate.state, *sides) for number in ([""] * 4 if state is None else state.tolist())]
 
 
 def _explanation_row(explanation: Explanation | None) -> list[object]:

@@ -86,6 +86,17 @@ class Tally:
     errors: dict[str, Errors] = field(default_factory=lambda: {"held": Errors(), "broken": Errors()})
     """Where the assumptions hold, and where they do not."""
     lacking: Lacking = field(default_factory=Lacking)
+    followed: Counter[str] = field(default_factory=Counter)
+    """Of the windows that a tracker followed: their outcomes, and where a truth is known, whether the box has it."""
+    followed_half_widths: NDArray[np.float64] = field(default_factory=lambda: np.zeros(4))
+
+    def follow(self, tracked: Estimate, truth: NDArray[np.float64] | None) -> None:
+        """Counts what a tracker made of one window, whose true state is known or not."""
+        self.followed[tracked.outcome.value] += 1
+        if tracked.box is not None:
+            self.followed_half_widths += tracked.box.half_widths
+            if truth is not None:
+                self.followed["inside" if tracked.box.contains(truth) else "outside"] += 1
 
     def add(self, estimate: Estimate, milliseconds: float, judgement: Judgement | None, explanation: Explanation | None) -> None:
         """Counts one window."""
@@ -114,6 +125,9 @@ class Tally:
         found["no_runway"] = self.counts["windows"] - self.counts["certified"]
         found["mean_half_widths"] = by_column(self.half_widths / certified)
         found["milliseconds_a_window"] = {"mean": self.milliseconds / windows, "largest": self.slowest_ms}
+        if self.followed:
+            boxes = max(self.followed["certified"], 1)
+            found["tracked"] = {**self.followed, "mean_half_widths": by_column(self.followed_half_widths / boxes)}
         if self.lacking.reasons:
             found["no_runway_explained"] = self.lacking.table(self.missed_budget, self.largest_budget)
         if self.counts["judged"]:
