@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from build_model.enclosure import columns_that_may_be_lit, columns_that_must_be_lit
-from build_model.pixel_mask import Runs, inset, paint, runs_of, widened
+from build_model.pixel_mask import VerticalRuns, inset, paint, runs_of, widened
 from build_model.spatial_filter import reference_row, sliced, spatial_filter
 from build_model.window import Bits, Window
 from runtime.model.limits import SCALE_STEP, SMALLEST_LEVER_M
@@ -69,9 +69,9 @@ class CellBank:
     """
 
     lines: LineBoxes
-    spatial: Runs
-    must_light: Runs
-    may_light: Runs
+    spatial: VerticalRuns
+    must_light: VerticalRuns
+    may_light: VerticalRuns
     window: Window
     state_lower: NDArray[np.float32]
     state_upper: NDArray[np.float32]

@@ -18,7 +18,7 @@ from runtime.scene import Scene
 
 
 @dataclass(frozen=True)
-class Runs:
+class VerticalRuns:
     """Masks as vertical runs: mask `mask[k]` holds rows [start[k], stop[k]) of column `column[k]`. Sorted by mask."""
 
     mask: NDArray[np.int64]
@@ -87,7 +87,7 @@ def paint(columns: Columns, window: Window) -> Bits:
     return bits
 
 
-def runs_of(bits: Bits, window: Window) -> Runs:
+def runs_of(bits: Bits, window: Window) -> VerticalRuns:
     """The vertical runs of masks given as bits (masks, rows, columns) in a window."""
     upright = np.swapaxes(bits, 1, 2)
     padded = np.zeros((*upright.shape[:2], upright.shape[2] + 2), dtype=np.int8)
@@ -95,4 +95,4 @@ def runs_of(bits: Bits, window: Window) -> Runs:
     steps = np.diff(padded, axis=2)
     mask, column, start = np.nonzero(steps == 1)
     stop = np.nonzero(steps == -1)[2]
-    return Runs(mask, column + window.left, start + window.top, stop + window.top)
+    return VerticalRuns(mask, column + window.left, start + window.top, stop + window.top)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from build_model.filter_tables import RunTable, SpatialRuns
 from build_model.hough_bank import CellBank
-from build_model.pixel_mask import Runs
+from build_model.pixel_mask import VerticalRuns
 from build_model.window import Window
 
 BLOCK_COST = 2500
@@ -34,7 +34,7 @@ def run_table(banks: Sequence[CellBank], window: Window, dilated: bool, width: i
     if folded := mirrored(runs, window):
         columns //= 2
         left = runs.column < window.left + columns
-        runs = Runs(runs.mask[left], runs.column[left], runs.start[left], runs.stop[left])
+        runs = VerticalRuns(runs.mask[left], runs.column[left], runs.start[left], runs.stop[left])
     in_must_light = (runs.mask >= first[1, 0]) & (runs.mask < first[2, 0])
     base = runs.column - window.left + np.where(in_must_light & dilated, (rows + 1) * columns, 0)
     ends = np.stack([(row - window.top) * columns + base for row in (runs.stop, runs.start)])
@@ -59,7 +59,7 @@ def spatial_runs(banks: Sequence[CellBank], window: Window) -> SpatialRuns:
     return SpatialRuns(*(np.concatenate(part).astype(np.int32) for part in parts))
 
 
-def mirrored(runs: Runs, window: Window) -> bool:
+def mirrored(runs: VerticalRuns, window: Window) -> bool:
     """True if every mask is its own mirror image about the window's middle, which no column of pixels lies on."""
     ends = np.stack([runs.start, runs.column, runs.mask])
     image = np.stack([runs.start, window.left + window.right - 1 - runs.column, runs.mask])
@@ -67,10 +67,10 @@ def mirrored(runs: Runs, window: Window) -> bool:
     return window.shape[1] % 2 == 0 and bool((ends[:, to] == image[:, back]).all() and (runs.stop[to] == runs.stop[back]).all())
 
 
-def _joined(parts: Sequence[Runs], first: NDArray[np.int64]) -> Runs:
+def _joined(parts: Sequence[VerticalRuns], first: NDArray[np.int64]) -> VerticalRuns:
     """All masks in one list; `first` is the number of each part's first mask."""
     mask = np.concatenate([part.mask + number for part, number in zip(parts, first, strict=True)])
-    return Runs(mask, *(np.concatenate([getattr(part, name) for part in parts]) for name in ("column", "start", "stop")))
+    return VerticalRuns(mask, *(np.concatenate([getattr(part, name) for part in parts]) for name in ("column", "start", "stop")))
 
 
 def _distinct(

@@ -1,4 +1,4 @@
-"""The rigid pinhole camera, and the conventions of the whole project.
+"""The rigid pinhole camera, and the conventions of the whole project; its words are in the glossary of docs/architecture.md.
 
 - State `[theta, x, y, z]`: pitch-down angle (rad), lateral position, altitude, and distance before the runway's threshold (m).
   The camera's centre in the Runway Coordinate Frame is (x, y, -z).

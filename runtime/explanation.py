@@ -27,7 +27,7 @@ Floats = NDArray[np.float64]
 STARTS, KEPT, ROUND = 256, 8, 128
 """States that the search draws from the entries, how many it goes on from, and how many it draws around them in a round."""
 ROUNDS, NARROWING = 8, 0.5
-"""Rounds, and the share of its reach that each keeps of the one before."""
+"""Rounds, and the share of the spread of its draws that each keeps of the one before."""
 SLACK = 2
 """Entries with so many more dark pixels than the best are searched too: an entry counts only what all of its states light."""
 
@@ -115,12 +115,12 @@ def _nearest_state(estimator: Estimator, frame: NDArray) -> Floats:
     sides = np.stack([entries.theta, entries.x, entries.scale, entries.z], axis=1)
     low, width = sides[..., 0], np.maximum(sides[..., 1] - sides[..., 0], 0)
     drawn = np.linspace(0, len(entries) - 1, STARTS).astype(int)
-    lines, tangents, reach = low[drawn] + width[drawn] * rng.random((STARTS, 4)), entries.tangent[drawn], width.mean(axis=0)
+    lines, tangents, spread = low[drawn] + width[drawn] * rng.random((STARTS, 4)), entries.tangent[drawn], width.mean(axis=0)
     for _ in range(ROUNDS):
         best = np.argsort(_dark_pixels(scene, sums, _states(scene, lines, tangents)), kind="stable")[:KEPT]
         around = np.resize(best, ROUND)
-        lines = np.concatenate([lines[best], lines[around] + reach * rng.standard_normal((ROUND, 4))])
-        tangents, reach = tangents[np.concatenate([best, around])], reach * NARROWING
+        lines = np.concatenate([lines[best], lines[around] + spread * rng.standard_normal((ROUND, 4))])
+        tangents, spread = tangents[np.concatenate([best, around])], spread * NARROWING
     states = _states(scene, lines, tangents)
     return states[np.argmin(_dark_pixels(scene, sums, states))]
 

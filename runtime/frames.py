@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.runs import STRETCH_STEP_BACK_US, Piece, Place, Runs
+from runtime.runs import STRETCH_STEP_BACK_US, ClockRuns, Piece, Place
 
 Frame = NDArray[np.uint8]
 
@@ -114,7 +114,7 @@ class FrameStream:
         self.outside_events = 0
         self.run = 0
         self.breaks: list[Break] = []
-        self._clock = Runs(self.largest_gap_us)
+        self._clock = ClockRuns(self.largest_gap_us)
         self._open: deque[_Run] = deque()
 
     @property

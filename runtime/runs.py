@@ -92,8 +92,8 @@ class Stretch:
         return self.latest_us - LARGEST_STEP_BACK_US <= time_us <= self.latest_us + LARGEST_STEP_AHEAD_US
 
 
-class Runs:
-    """Parts a stream of events, packet by packet, into runs. `misdated_events` counts what no run has.
+class ClockRuns:
+    """Parts a stream of events, packet by packet, into runs of the camera's clock. `misdated_events` counts what no run has.
 
     `feed` and `flush` give the pieces of the stream that are now believed, in order of arrival.
     """

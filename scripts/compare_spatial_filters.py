@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 from rich.table import Table
 
-from build_model.paper.bounds import Method
+from build_model.paper.method import Method
 from build_model.paper.reachability import possible_pixels
 from build_model.partition import partition
 from build_model.spatial_filter import spatial_filters

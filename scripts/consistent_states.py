@@ -158,8 +158,8 @@ class Sampler:
         start, one, other = rng.integers(len(known), size=(3, STEPS))
         share = np.exp(rng.uniform(np.log(SMALLEST_STEP), np.log(LARGEST_STEP), (STEPS, 1)))
         at_random = np.exp(rng.uniform(np.log(RANDOM_PX[0]), np.log(RANDOM_PX[1]), (STEPS, 1))) * rng.normal(size=(STEPS, 4))
-        reach = np.abs(self._scene.runway.x_m - self.states[0, 1]).max()
-        at_random /= [reach, reach, 1, 1]
+        farthest_m = np.abs(self._scene.runway.x_m - self.states[0, 1]).max()
+        at_random /= [farthest_m, farthest_m, 1, 1]
         step = np.where(rng.random((STEPS, 1)) < 0.8, share * (known[one] - known[other]), at_random)
         states = self._line.states(known[start] + step)
         leap = rng.random(STEPS) < LEAPS  # the same lines at any distance: parts that lie apart, where ends fall on other missed pixels

@@ -115,11 +115,11 @@ class RunwayImage:
         """Numbers of the pixels in the flattened frame, ascending."""
         return self.rows * self.frame.shape[1] + self.columns
 
-    def thickened(self, reach: int) -> Frame:
-        """A frame in which everything is lit that lies within `reach` rows and columns of a pixel."""
+    def thickened(self, radius_px: int) -> Frame:
+        """A frame in which everything is lit that lies within `radius_px` rows and columns of a pixel."""
         thick = np.zeros_like(self.frame)
         for row, column in zip(self.rows.tolist(), self.columns.tolist(), strict=True):
-            thick[max(row - reach, 0) : row + reach + 1, max(column - reach, 0) : column + reach + 1] = True
+            thick[max(row - radius_px, 0) : row + radius_px + 1, max(column - radius_px, 0) : column + radius_px + 1] = True
         return thick
 
 

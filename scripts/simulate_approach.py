@@ -305,8 +305,8 @@ class EventCamera:
         """Pixels with a threshold's difference between their level and the light now, theirs or a neighbour's within the motion."""
         shape = self.flight.scene.camera.shape
         light = self.ground.log_light(self._u, self._v, views[len(views) // 2 :][:1])[0].reshape(shape)
-        reach = self._motion_px(views.to_ground)
-        around = np.ones((2 * reach + 1, 2 * reach + 1), dtype=np.uint8)
+        motion_px = self._motion_px(views.to_ground)
+        around = np.ones((2 * motion_px + 1, 2 * motion_px + 1), dtype=np.uint8)
         level, threshold = self._level, self._threshold
         can = (cv2.dilate(light, around).ravel() - level >= threshold) | (level - cv2.erode(light, around).ravel() >= threshold)
         return np.flatnonzero(can & self._alive)

@@ -151,7 +151,8 @@ def states_in(scene: Scene, sets: StateSet, count: int, seed: int) -> Floats:
     sides = np.stack([sets.theta[0], sets.x[0], sets.scale[0], sets.z[0]])
     share = rng.random((count, 4))
     share[: count // 2] = np.round(share[: count // 2])  # half of them on corners
-    theta, x, scale, z = (sides[:, 0] + share * (sides[:, 1] - sides[:, 0])).T
+    # a + (b - a) may exceed b by its last bit: such a state would be no state of the set
+    theta, x, scale, z = np.minimum(sides[:, 0] + share * (sides[:, 1] - sides[:, 0]), sides[:, 1]).T
     row = scene.camera.v0 + scene.camera.focal_px * sets.tangent[0]
     y = ground_scale(scene.camera, theta, 1.0, row) / scale
     keep = (y >= sets.y[0, 0]) & (y <= sets.y[0, 1])

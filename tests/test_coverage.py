@@ -24,7 +24,7 @@ pytest.importorskip("faery", reason="the extra 'recordings' is not installed")
 import typer
 from coverage import campaign, frames, states
 from coverage.chunk import code
-from coverage.judge import Tally, claimed_by_none, judge_frame, quantile
+from coverage.judge import Tally, extra_pixels, judge_frame, quantile
 from coverage.models import DERIVED
 from coverage.scenarios import Scenario, camera_off, scenarios
 from coverage.states import Rng, Stage
@@ -174,11 +174,11 @@ def test_exactly_as_many_pixels_are_missed_as_are_said(paper: Stage, rng: Rng, o
         assert (~picture.frame).sum() == missed
 
 
-def test_as_many_pixels_are_claimed_by_none_as_are_said(paper: Stage, rng: Rng) -> None:
+def test_as_many_pixels_are_extra_pixels_as_are_said(paper: Stage, rng: Rng) -> None:
     for extra in (0, 1, 8):
         picture, _, e = Scenario("", (frames.everything,), extra=(extra,)).draw(rng, paper)
         assert e == extra
-        assert claimed_by_none(picture, picture.states[0]) == extra
+        assert extra_pixels(picture, picture.states[0]) == extra
         assert picture.frame.mean() > 0.9
 
 

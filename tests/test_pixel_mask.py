@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scenes import PAPER, examples
 
-from build_model.pixel_mask import Runs, inset, paint, runs_of, widened, window_of
+from build_model.pixel_mask import VerticalRuns, inset, paint, runs_of, widened, window_of
 from build_model.window import Window
 from runtime.scene import Camera, Scene
 
@@ -131,7 +131,7 @@ def test_runs_are_the_loops_and_give_the_bits_back(drawn: tuple[NDArray[np.bool_
 
 def test_an_empty_set_of_runs_has_sizes_of_zero() -> None:
     none = np.zeros(0, dtype=np.int64)
-    assert Runs(none, none, none, none).sizes(3).tolist() == [0, 0, 0]
+    assert VerticalRuns(none, none, none, none).sizes(3).tolist() == [0, 0, 0]
 
 
 @pytest.mark.parametrize("scene", [SMALL], ids=["small"])

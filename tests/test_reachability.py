@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from rich.progress import Progress
 from scenes import examples
 
-from build_model.paper.bounds import Method
-from build_model.paper.intervals import Interval
+from build_model.paper.intervals import RoundedInterval
+from build_model.paper.method import Method
 from build_model.paper.mixed_monotonicity import mixed_monotone_bounds
 from build_model.paper.network_bounds import (
     linear_layer_by_intervals,
@@ -128,8 +128,8 @@ def test_proposition_2_is_exact_for_monotone_maps_and_batches_of_boxes() -> None
 @given(st.data(), st.floats(-1.5, 1.5), st.floats(0, 1))
 def test_intervals_contain_points(data: st.DataObject, angle: float, spread: float) -> None:
     points = [data.draw(st.floats(-3, 3)), data.draw(st.floats(0.5, 3))]
-    a, b = (Interval(np.array(point - spread / 4), np.array(point + spread / 4)) for point in points)
-    turned = Interval(np.array(max(angle - spread, -np.pi / 2)), np.array(min(angle + spread, np.pi / 2)))
+    a, b = (RoundedInterval(np.array(point - spread / 4), np.array(point + spread / 4)) for point in points)
+    turned = RoundedInterval(np.array(max(angle - spread, -np.pi / 2)), np.array(min(angle + spread, np.pi / 2)))
     x, y = points
     results = [(a + b, x + y), (a - b, x - y), (a * b, x * y), (a / b, x / y), (a.square(), x * x)]
     results += [(turned.sin(), np.sin(angle)), (turned.cos(), np.cos(angle))]
@@ -322,7 +322,7 @@ def test_masks_contain_the_images_of_a_cell(method: Method, cell: int) -> None:
 
 @pytest.mark.parametrize("method", Method)
 def test_masks_of_a_small_box_are_tight(method: Method) -> None:
-    """Over a box of a tenth of a millimetre the masks come close to the union itself, and NN_r alone needs no help for it. Interval
+    """Over a box of a tenth of a millimetre the masks come close to the union itself, and NN_r alone needs no help for it. RoundedInterval
     arithmetic stays several pixels wide: det is a difference of two numbers near 70,000 px^2."""
     centre = np.array([0.61, 0.0, 0.93, 1.71])
     half = np.array([1e-4, 0, 1e-4, 1e-4])

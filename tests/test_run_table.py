@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from build_model.filter_tables import RunTable
 from build_model.hough_bank import CellBank, LineBoxes
-from build_model.pixel_mask import Runs, runs_of
+from build_model.pixel_mask import VerticalRuns, runs_of
 from build_model.run_table import BLOCK_COST, block_borders, mirrored, run_table, spatial_runs
 from build_model.window import Window
 
@@ -111,8 +111,8 @@ def test_painting_the_spatial_runs_gives_the_masks(drawn: list[tuple[Bits, Bits,
 
 def test_no_mirror_image_is_seen_where_a_column_is_the_middle() -> None:
     none = np.zeros(0, dtype=np.int64)
-    assert mirrored(Runs(none, none, none, none), Window(0, 4, 0, 6))
-    assert not mirrored(Runs(none, none, none, none), Window(0, 4, 0, 7))
+    assert mirrored(VerticalRuns(none, none, none, none), Window(0, 4, 0, 6))
+    assert not mirrored(VerticalRuns(none, none, none, none), Window(0, 4, 0, 7))
 
 
 @given(falls=st.lists(st.integers(0, 4000), min_size=0, max_size=7), masks=st.integers(1, 9000))

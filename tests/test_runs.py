@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from runtime import runs
 from runtime.frames import LARGEST_GAP_US, Break, FrameStream
-from runtime.runs import CONFIRMING_EVENTS, CONFIRMING_US, LARGEST_STEP_AHEAD_US, LARGEST_STEP_BACK_US, Place, Runs
+from runtime.runs import CONFIRMING_EVENTS, CONFIRMING_US, LARGEST_STEP_AHEAD_US, LARGEST_STEP_BACK_US, ClockRuns, Place
 
 EVENT = np.dtype([("t", np.int64), ("x", np.int16), ("y", np.int16), ("p", np.int8)])
 SHAPE = (2, 3)
@@ -89,8 +89,8 @@ def parts_of(times: list[int], cuts: list[int]) -> list[list[int]]:
 
 
 def numbered(times: list[int], cuts: list[int], gap_us: int) -> tuple[list[int | None], int, int]:
-    """What `Runs` makes of the times: each event is told by its number in place of a pixel."""
-    parted = Runs(gap_us)
+    """What `ClockRuns` makes of the times: each event is told by its number in place of a pixel."""
+    parted = ClockRuns(gap_us)
     found: list[int | None] = [None] * len(times)
     number, given_order = -1, []
     packets = [(np.array([times[place] for place in part]), np.array(part)) for part in parts_of(times, cuts)]

@@ -10,12 +10,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from build_model.paper.bounds import Bounds, Floats
+from runtime.refine.interval import Floats, Interval
 
 
 def mixed_monotone_bounds(
     f: Callable[[Floats], Floats], jacobian_lower: Floats, jacobian_upper: Floats, lower: Floats, upper: Floats
-) -> Bounds:
+) -> Interval:
     """Range of a vector map over boxes, from bounds on its Jacobian there (paper, Proposition 2, corrected).
 
     With row i of the Jacobian centred at J*: psi_lo_j, psi_hi_j, alpha_j = lower_j, upper_j, min(0, J_lo) where J*_j >= 0, else

@@ -13,11 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from build_model.paper.bounds import Bounds, Floats, Method
+from build_model.paper.method import Method
 from build_model.paper.mixed_monotonicity import mixed_monotone_bounds
 from build_model.paper.network_layers import Layer, determinant, layers, pairs_of
 from build_model.paper.runway_network import ABS_PAIRS, MIN_PAIRS, pixel_weights
 from build_model.window import Window
+from runtime.refine.interval import Floats, Interval, intersected
 
 ZETA_BITS = 22
 """Bits of a snapped coordinate of zeta. A product takes 44, Proposition 2 up to 9 more: float64's 53 hold them all."""
@@ -26,7 +27,7 @@ PIXELS_AT_ONCE = 128
 """Pixels whose Jacobians are held in memory together."""
 
 
-def _interval_product(left: Bounds, right: Bounds) -> Bounds:
+def _interval_product(left: Interval, right: Interval) -> Interval:
     """Bounds of the product of two matrices between bounds, (pixels, n, m) and (pixels, m, p)."""
     factors = (left[0][..., None], left[1][..., None])
     from_low, from_high = [(a * right[0][:, None], a * right[1][:, None]) for a in factors]
@@ -35,21 +36,17 @@ def _interval_product(left: Bounds, right: Bounds) -> Bounds:
     return low.sum(axis=-2), high.sum(axis=-2)
 
 
-def _intersect(first: Bounds, second: Bounds) -> Bounds:
-    return np.maximum(first[0], second[0]), np.minimum(first[1], second[1])
-
-
 @dataclass(frozen=True)
 class _PartialNetwork:
     """The layers from one source on, over the box of that source's values; `reached` holds all that they make of the box."""
 
-    source: Bounds
+    source: Interval
     maps: tuple[Callable[[Floats], Floats], ...]
-    jacobian: Bounds
-    reached: Bounds
+    jacobian: Interval
+    reached: Interval
 
     @staticmethod
-    def start(box: Bounds) -> _PartialNetwork:
+    def start(box: Interval) -> _PartialNetwork:
         identity = np.broadcast_to(np.eye(box[0].shape[-1]), (*box[0].shape, box[0].shape[-1]))
         return _PartialNetwork(box, (), (identity, identity), box)
 
@@ -65,10 +62,10 @@ class _PartialNetwork:
 
         from_source = mixed_monotone_bounds(whole, *jacobian, *self.source)
         from_before = mixed_monotone_bounds(layer.apply, *own, *self.reached) if self.maps else from_source
-        return _PartialNetwork(self.source, maps, jacobian, _intersect(from_source, from_before))
+        return _PartialNetwork(self.source, maps, jacobian, intersected(from_source, from_before))
 
 
-def mixed_monotone_layers(network: Sequence[Layer], lower: Floats, upper: Floats) -> list[Bounds]:
+def mixed_monotone_layers(network: Sequence[Layer], lower: Floats, upper: Floats) -> list[Interval]:
     """Bounds of every layer's outputs over boxes of zeta, by Proposition 2 on all partial networks, intersected (Meyer 2022).
 
     `lower`, `upper`: (pixels, 4) px. Returns one pair of arrays (pixels, outputs) a layer. Exact arithmetic on snapped boxes.
@@ -76,11 +73,11 @@ def mixed_monotone_layers(network: Sequence[Layer], lower: Floats, upper: Floats
     boxes, partials = [(lower, upper)], list[_PartialNetwork]()
     for layer in network:
         partials = [partial.then(layer) for partial in [*partials, _PartialNetwork.start(boxes[-1])]]
-        boxes.append(functools.reduce(_intersect, (partial.reached for partial in partials)))
+        boxes.append(functools.reduce(intersected, (partial.reached for partial in partials)))
     return boxes[1:]
 
 
-def linear_layer_by_intervals(weights: Floats, lower: Floats, upper: Floats) -> Bounds:
+def linear_layer_by_intervals(weights: Floats, lower: Floats, upper: Floats) -> Interval:
     """Bounds of phi_Lin over a box of zeta (4,) by interval arithmetic on det and on W. Returns two arrays (pixels, 16)."""
     (u1_v2, v1_u2) = (np.outer([lower[a], upper[a]], [lower[b], upper[b]]) for a, b in ((0, 3), (1, 2)))
     low = np.array([*lower, u1_v2.min() - v1_u2.max(), 1.0])
@@ -89,7 +86,7 @@ def linear_layer_by_intervals(weights: Floats, lower: Floats, upper: Floats) -> 
     return np.minimum(*ends).sum(axis=-1), np.maximum(*ends).sum(axis=-1)
 
 
-def linear_layer_range(weights: Floats, lower: Floats, upper: Floats) -> Bounds:
+def linear_layer_range(weights: Floats, lower: Floats, upper: Floats) -> Interval:
     """Exact range of phi_Lin over a box of zeta (4,): it is affine in each coordinate, so its extremes lie at the 16 corners."""
     corners = np.array(list(itertools.product(*zip(lower, upper, strict=True))))
     inputs = np.concatenate([determinant(corners), np.ones((16, 1))], axis=-1)
@@ -97,7 +94,7 @@ def linear_layer_range(weights: Floats, lower: Floats, upper: Floats) -> Bounds:
     return values.min(axis=-2), values.max(axis=-2)
 
 
-def _upper_bound_of_image(linear: Bounds) -> Floats:
+def _upper_bound_of_image(linear: Interval) -> Floats:
     """Upper bound of NN_r (pixels,) from bounds of phi_Lin: the exact ranges of phi_Abs, phi_Min and ReLU over their boxes.
 
     |a| + |b| - |a + b| = 2 max(0, min(a, -b), min(-a, b)), so its largest value lies at (a_high, b_low) or (a_low, b_high).
@@ -107,7 +104,7 @@ def _upper_bound_of_image(linear: Bounds) -> Floats:
     return np.minimum(*pairs_of(crossing, MIN_PAIRS)).sum(axis=-1)
 
 
-def snap_outward(lower: Floats, upper: Floats, window: Window) -> Bounds:
+def snap_outward(lower: Floats, upper: Floats, window: Window) -> Interval:
     """Boxes of zeta widened to multiples of 2^(e - ZETA_BITS) px, where 2^e exceeds every coordinate of boxes and window."""
     largest = max(np.abs(lower).max(), np.abs(upper).max(), window.bottom, window.right) + 1
     grid = 2.0 ** (np.ceil(np.log2(largest)) - ZETA_BITS)

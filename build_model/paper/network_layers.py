@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from build_model.paper.bounds import Bounds, Floats
 from build_model.paper.runway_network import ABS_PAIRS, MIN_PAIRS
+from runtime.refine.interval import Floats, Interval
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class Layer:
     """
 
     apply: Callable[[Floats], Floats]
-    jacobian: Callable[[Floats, Floats], Bounds]
+    jacobian: Callable[[Floats, Floats], Interval]
 
 
 def layers(weights: Floats, *, printed_jacobians: bool = False) -> list[Layer]:
@@ -62,7 +62,7 @@ def determinant(zeta: Floats) -> Floats:
     return np.concatenate([zeta, (u1 * v2 - v1 * u2)[..., None]], axis=-1)
 
 
-def _det_jacobian(lower: Floats, upper: Floats) -> Bounds:
+def _det_jacobian(lower: Floats, upper: Floats) -> Interval:
     identity = np.broadcast_to(np.eye(4), (len(lower), 4, 4))
     rows = [np.stack([a[:, 3], -b[:, 2], -b[:, 1], a[:, 0]], axis=-1)[:, None] for a, b in ((lower, upper), (upper, lower))]
     return np.concatenate([identity, rows[0]], axis=1), np.concatenate([identity, rows[1]], axis=1)
@@ -82,19 +82,19 @@ def _place(pairs: tuple[tuple[int, int], ...], inputs: int, first: Floats, secon
     return jacobian
 
 
-def _constant_jacobian(pairs: tuple[tuple[int, int], ...], inputs: int, low: float, high: float) -> Callable[[Floats, Floats], Bounds]:
-    def jacobian(lower: Floats, _upper: Floats) -> Bounds:
+def _constant_jacobian(pairs: tuple[tuple[int, int], ...], inputs: int, low: float, high: float) -> Callable[[Floats, Floats], Interval]:
+    def jacobian(lower: Floats, _upper: Floats) -> Interval:
         ones = np.ones((len(lower), len(pairs)))
         return _place(pairs, inputs, low * ones, low * ones), _place(pairs, inputs, high * ones, high * ones)
 
     return jacobian
 
 
-def _abs_jacobian(lower: Floats, upper: Floats) -> Bounds:
+def _abs_jacobian(lower: Floats, upper: Floats) -> Interval:
     """d/da (|a| + |b| - |a + b|) is 2 where a > 0 > a + b, -2 where a < 0 < a + b, else 0; likewise for b."""
     (a_low, b_low), (a_high, b_high) = pairs_of(lower, ABS_PAIRS), pairs_of(upper, ABS_PAIRS)
 
-    def derivative(low: Floats, high: Floats, other_low: Floats, other_high: Floats) -> Bounds:
+    def derivative(low: Floats, high: Floats, other_low: Floats, other_high: Floats) -> Interval:
         falls = (low < 0) & (np.minimum(high, 0) + other_high > 0)
         rises = (high > 0) & (np.maximum(low, 0) + other_low < 0)
         return np.where(falls, -2.0, 0.0), np.where(rises, 2.0, 0.0)
@@ -103,7 +103,7 @@ def _abs_jacobian(lower: Floats, upper: Floats) -> Bounds:
     return _place(ABS_PAIRS, 16, first[0], second[0]), _place(ABS_PAIRS, 16, first[1], second[1])
 
 
-def _min_jacobian(lower: Floats, upper: Floats) -> Bounds:
+def _min_jacobian(lower: Floats, upper: Floats) -> Interval:
     """d/da min(a, b) is 1 where a < b and 0 where a > b."""
     (a_low, b_low), (a_high, b_high) = pairs_of(lower, MIN_PAIRS), pairs_of(upper, MIN_PAIRS)
     low = _place(MIN_PAIRS, 12, (a_high < b_low).astype(np.float64), (b_high < a_low).astype(np.float64))
@@ -111,7 +111,7 @@ def _min_jacobian(lower: Floats, upper: Floats) -> Bounds:
     return low, high
 
 
-def _relu_jacobian(lower: Floats, upper: Floats) -> Bounds:
+def _relu_jacobian(lower: Floats, upper: Floats) -> Interval:
     """d ReLU(sum) is 1 where the sum is positive and 0 where it is negative."""
     low, high = lower.sum(axis=-1) > 0, upper.sum(axis=-1) > 0
     wide = np.ones((len(lower), 1, lower.shape[-1]))

@@ -9,8 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from build_model.paper.bounds import Bounds, Floats, Method
+from build_model.paper.method import Method
 from build_model.paper.projection_bounds import projection_jacobian, zeta_bounds
+from runtime.refine.interval import Floats, Interval
 from runtime.rounding import above
 from runtime.scene import Scene
 
@@ -93,7 +94,7 @@ def _rounded_up(value: float) -> float:
     return math.ldexp(math.ceil(math.ldexp(mantissa, KEPT_BITS)), exponent - KEPT_BITS)
 
 
-def _pieces(lower: Floats, upper: Floats) -> Bounds:
+def _pieces(lower: Floats, upper: Floats) -> Interval:
     """The box [lower, upper], both (4,), cut into up to MOST_PIECES pieces along its free axes: two arrays (pieces, 4)."""
     cuts = round(MOST_PIECES ** (1 / (upper > lower).sum()))
     edges = [np.linspace(low, high, cuts + 1 if high > low else 2) for low, high in zip(lower, upper, strict=True)]

@@ -9,10 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from build_model.paper.bounds import Bounds, Floats, Method
-from build_model.paper.intervals import Interval
+from build_model.paper.intervals import RoundedInterval
+from build_model.paper.method import Method
 from build_model.paper.mixed_monotonicity import mixed_monotone_bounds
 from runtime.camera import project, row_of_point
+from runtime.refine.interval import Floats, Interval
 from runtime.rounding import above, below
 from runtime.scene import Scene
 
@@ -21,29 +22,29 @@ from runtime.scene import Scene
 class _EndGeometry:
     """The camera's equations (`runtime.camera`) for every end of every marking over boxes of states; fields (..., markings, 2)."""
 
-    sine: Interval
-    cosine: Interval
-    across: Interval  # X = p_x - x
-    altitude: Interval  # y
-    ahead: Interval  # d = p_z + z
-    upward: Interval  # Y
-    depth: Interval  # Z
+    sine: RoundedInterval
+    cosine: RoundedInterval
+    across: RoundedInterval  # X = p_x - x
+    altitude: RoundedInterval  # y
+    ahead: RoundedInterval  # d = p_z + z
+    upward: RoundedInterval  # Y
+    depth: RoundedInterval  # Z
 
 
 def _end_geometry(scene: Scene, lower: Floats, upper: Floats) -> _EndGeometry:
-    theta, x, y, z = (Interval(lower[..., axis, None, None], upper[..., axis, None, None]) for axis in range(4))
+    theta, x, y, z = (RoundedInterval(lower[..., axis, None, None], upper[..., axis, None, None]) for axis in range(4))
     sine, cosine = theta.sin(), theta.cos()
-    across, ahead = Interval.of(scene.runway.x_m[:, None]) - x, Interval.of(scene.runway.ends_z_m) + z
+    across, ahead = RoundedInterval.of(scene.runway.x_m[:, None]) - x, RoundedInterval.of(scene.runway.ends_z_m) + z
     return _EndGeometry(sine, cosine, across, y, ahead, ahead * sine - y * cosine, y * sine + ahead * cosine)
 
 
-def _stack(parts: Sequence[Interval], axis: int) -> Interval:
+def _stack(parts: Sequence[RoundedInterval], axis: int) -> RoundedInterval:
     lowers = np.broadcast_arrays(*(part.lower for part in parts))
     uppers = np.broadcast_arrays(*(part.upper for part in parts))
-    return Interval(np.stack(lowers, axis=axis), np.stack(uppers, axis=axis))
+    return RoundedInterval(np.stack(lowers, axis=axis), np.stack(uppers, axis=axis))
 
 
-def projection_jacobian(scene: Scene, lower: ArrayLike, upper: ArrayLike) -> Bounds:
+def projection_jacobian(scene: Scene, lower: ArrayLike, upper: ArrayLike) -> Interval:
     """Bounds of the Jacobian of zeta = (u1, v1, u2, v2) by (theta, x, y, z), by interval arithmetic.
 
         du = F (X Y / Z^2, -1 / Z, -X sin(theta) / Z^2, -X cos(theta) / Z^2)
@@ -53,17 +54,17 @@ def projection_jacobian(scene: Scene, lower: ArrayLike, upper: ArrayLike) -> Bou
     Raises `ValueError` if intervals cannot exclude Z <= 0.
     """
     geometry = _end_geometry(scene, np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64))
-    one, focal, squared = Interval.of(1.0), Interval.of(scene.camera.focal_px), geometry.depth.square()
+    one, focal, squared = RoundedInterval.of(1.0), RoundedInterval.of(scene.camera.focal_px), geometry.depth.square()
     side, rise = geometry.across / geometry.depth, geometry.upward / geometry.depth
     shrink = side / geometry.depth
     u = _stack([side * rise, -(one / geometry.depth), -(shrink * geometry.sine), -(shrink * geometry.cosine)], axis=-1)
-    v = _stack([-(one + rise.square()), Interval.of(0.0), geometry.ahead / squared, -(geometry.altitude / squared)], axis=-1)
+    v = _stack([-(one + rise.square()), RoundedInterval.of(0.0), geometry.ahead / squared, -(geometry.altitude / squared)], axis=-1)
     jacobian = focal * _stack([u, v], axis=-2)
     shape = (*jacobian.lower.shape[:-3], 4, 4)
     return jacobian.lower.reshape(shape), jacobian.upper.reshape(shape)
 
 
-def zeta_bounds(scene: Scene, lower: ArrayLike, upper: ArrayLike, method: Method) -> Bounds:
+def zeta_bounds(scene: Scene, lower: ArrayLike, upper: ArrayLike, method: Method) -> Interval:
     """Bounds of zeta = h(xi) over boxes of states.
 
     `lower`, `upper`: (..., 4) with y > 0 and all ends ahead of the camera. Returns two arrays (..., markings, 4) px, order
@@ -76,7 +77,7 @@ def zeta_bounds(scene: Scene, lower: ArrayLike, upper: ArrayLike, method: Method
     return below(zeta_low), above(zeta_high)
 
 
-def _zeta_mixed(scene: Scene, lower: Floats, upper: Floats) -> Bounds:
+def _zeta_mixed(scene: Scene, lower: Floats, upper: Floats) -> Interval:
     jacobian_low, jacobian_high = projection_jacobian(scene, lower, upper)
     bounds = []
     for marking in range(len(scene.runway.markings)):
@@ -88,17 +89,17 @@ def _zeta_mixed(scene: Scene, lower: Floats, upper: Floats) -> Bounds:
     return np.stack([low for low, _ in bounds], axis=-2), np.stack([high for _, high in bounds], axis=-2)
 
 
-def _zeta_intervals(scene: Scene, lower: Floats, upper: Floats) -> Bounds:
+def _zeta_intervals(scene: Scene, lower: Floats, upper: Floats) -> Interval:
     geometry, camera = _end_geometry(scene, lower, upper), scene.camera
-    focal = Interval.of(camera.focal_px)
-    u = Interval.of(camera.u0) + focal * (geometry.across / geometry.depth)
-    v = Interval.of(camera.v0) - focal * (geometry.upward / geometry.depth)
+    focal = RoundedInterval.of(camera.focal_px)
+    u = RoundedInterval.of(camera.u0) + focal * (geometry.across / geometry.depth)
+    v = RoundedInterval.of(camera.v0) - focal * (geometry.upward / geometry.depth)
     zeta = _stack([u, v], axis=-1)
     shape = (*zeta.lower.shape[:-2], 4)
     return zeta.lower.reshape(shape), zeta.upper.reshape(shape)
 
 
-def _zeta_closed_form(scene: Scene, lower: Floats, upper: Floats) -> Bounds:
+def _zeta_closed_form(scene: Scene, lower: Floats, upper: Floats) -> Interval:
     """Row of an end: up in y, down in z and theta. Column: X/Z, where X depends on x only and Z on all but x: both ranges are met."""
     camera = scene.camera
     theta, y = ((lower[..., axis, None, None], upper[..., axis, None, None]) for axis in (0, 2))
@@ -114,7 +115,7 @@ def _zeta_closed_form(scene: Scene, lower: Floats, upper: Floats) -> Bounds:
     return low.reshape(*low.shape[:-2], 4), high.reshape(*high.shape[:-2], 4)
 
 
-def _depth_range(theta: Bounds, y: Bounds, ahead: Bounds) -> Bounds:
+def _depth_range(theta: Interval, y: Interval, ahead: Interval) -> Interval:
     """Exact range of Z = y sin(theta) + d cos(theta) > 0: linear in y and d, and concave in theta with its top at atan2(y, d)."""
     depths = []
     for altitude, distance in itertools.product(y, ahead):

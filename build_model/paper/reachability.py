@@ -16,10 +16,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from build_model.paper.bounds import Floats, Method
+from build_model.paper.method import Method
 from build_model.paper.network_bounds import network_upper_bounds
 from build_model.paper.projection_bounds import zeta_bounds
 from build_model.window import Bits, Window
+from runtime.refine.interval import Floats
 from runtime.scene import Scene
 
 

@@ -29,7 +29,7 @@ from flint import arb  # pyright: ignore[reportMissingModuleSource]
 from runtime.scene import Camera
 
 PRECISION_BITS = 64
-Range = tuple[arb, arb]
+BallInterval = tuple[arb, arb]
 """Two balls, the lower and the upper bound."""
 
 
@@ -49,10 +49,10 @@ class BallCamera:
     def __init__(self, camera: Camera) -> None:
         self.focal_px = arb(camera.focal_length_m) / arb(camera.pixel_pitch_m)
         self.u0, self.v0 = arb(camera.u0), arb(camera.v0)
-        self._turns: dict[float, Range] = {}
-        self._rays: dict[tuple[float, float], Range] = {}
+        self._turns: dict[float, BallInterval] = {}
+        self._rays: dict[tuple[float, float], BallInterval] = {}
 
-    def turn(self, theta: float) -> Range:
+    def turn(self, theta: float) -> BallInterval:
         """sin(theta) and cos(theta)."""
         turn = self._turns.get(theta)
         if turn is None:
@@ -63,7 +63,7 @@ class BallCamera:
         """tau = (v - v0)/F of a row."""
         return (arb(row) - self.v0) / self.focal_px
 
-    def ray(self, theta: float, row: float) -> Range:
+    def ray(self, theta: float, row: float) -> BallInterval:
         """fall and reach of a row's ray, y/Z and d/Z."""
         ray = self._rays.get((theta, row))
         if ray is None:
@@ -76,7 +76,7 @@ class BallCamera:
         sine, cosine = self.turn(theta)
         return self.v0 - self.focal_px * (d * sine - y * cosine) / (y * sine + d * cosine)
 
-    def fall_range(self, low: float, high: float, row: float) -> Range:
+    def fall_range(self, low: float, high: float, row: float) -> BallInterval:
         """Range of fall over theta in [low, high]: sqrt(1 + tau^2) times the sine of an angle in (-pi, pi)."""
         (first, ahead_first), (last, ahead_last) = self.ray(low, row), self.ray(high, row)
         if ahead_first >= 0 and ahead_last >= 0:
@@ -86,7 +86,7 @@ class BallCamera:
         falling = above_horizon and ahead_first <= 0 and ahead_last <= 0
         return first.min(last) if above_horizon else -peak, first if falling else peak
 
-    def reach_range(self, low: float, high: float, row: float) -> Range:
+    def reach_range(self, low: float, high: float, row: float) -> BallInterval:
         """Range of reach over theta in [low, high]: sqrt(1 + tau^2) times the cosine of an angle in (-pi, pi), which has one peak."""
         (fall_first, first), (fall_last, last) = self.ray(low, row), self.ray(high, row)
         if fall_first >= 0:
@@ -102,8 +102,8 @@ class BallCamera:
 class Ends:
     """Distances ahead of a marking's near and far end, each a range over the states, m. Markings with the same ends share one."""
 
-    near: Range
-    far: Range
+    near: BallInterval
+    far: BallInterval
 
 
 @dataclass(frozen=True)
@@ -115,10 +115,10 @@ class BallEntry:
 
     camera: BallCamera
     theta: tuple[float, float]
-    x: Range
-    y: Range
-    z: Range
-    scale: Range
+    x: BallInterval
+    y: BallInterval
+    z: BallInterval
+    scale: BallInterval
     reference_row: float
 
 
@@ -132,11 +132,11 @@ class Slice:
     entry: BallEntry
     low: float
     high: float
-    y: Range = field(init=False)
+    y: BallInterval = field(init=False)
     sees_ground: bool = field(init=False)
     _halves: tuple[Slice, Slice] | None = field(init=False, default=None)
-    _rows: dict[Ends, tuple[Range, Range] | None] = field(init=False, default_factory=dict)
-    _scales: dict[tuple[Ends, int], Range | None] = field(init=False, default_factory=dict)
+    _rows: dict[Ends, tuple[BallInterval, BallInterval] | None] = field(init=False, default_factory=dict)
+    _scales: dict[tuple[Ends, int], BallInterval | None] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         entry, camera = self.entry, self.entry.camera
@@ -163,7 +163,7 @@ class Slice:
             self._halves = Slice(self.entry, self.low, self.middle), Slice(self.entry, self.middle, self.high)
         return self._halves
 
-    def depth(self, d: Range) -> Range:
+    def depth(self, d: BallInterval) -> BallInterval:
         """Range of Z = y sin(theta) + d cos(theta)."""
         (sine_low, cosine_first), (sine_high, cosine_last) = self.entry.camera.turn(self.low), self.entry.camera.turn(self.high)
         cosine_high = arb(1) if self.low < 0 < self.high else cosine_first.max(cosine_last)
@@ -171,20 +171,20 @@ class Slice:
         highest = (self.y[0] * sine_high).max(self.y[1] * sine_high) + d[1] * cosine_high
         return lowest, highest
 
-    def rows(self, ends: Ends) -> tuple[Range, Range] | None:
+    def rows(self, ends: Ends) -> tuple[BallInterval, BallInterval] | None:
         """Ranges of v of the near and of the far end; None unless every state has both certainly in front of it."""
         if ends not in self._rows:
             self._rows[ends] = self._end_rows(ends)
         return self._rows[ends]
 
-    def _end_rows(self, ends: Ends) -> tuple[Range, Range] | None:
+    def _end_rows(self, ends: Ends) -> tuple[BallInterval, BallInterval] | None:
         if not (self.sees_ground and self.entry.y[0] > 0 and ends.near[0] > 0 and self.depth((ends.near[0], ends.far[1]))[0] > 0):
             return None
         row = self.entry.camera.row
         near, far = ((row(self.high, self.y[0], d[1]), row(self.low, self.y[1], d[0])) for d in (ends.near, ends.far))
         return near, far
 
-    def scale_at(self, row: int) -> Range:
+    def scale_at(self, row: int) -> BallInterval:
         """Range of g at a row: scale fall(row)/fall(reference row), and F fall/y within the cell's altitudes; 0 at the horizon."""
         entry, camera = self.entry, self.entry.camera
         first, last = (camera.ray(theta, row)[0] / camera.ray(theta, entry.reference_row)[0] for theta in (self.low, self.high))
@@ -193,7 +193,7 @@ class Slice:
         lowest = greatest(entry.scale[0] * low, camera.focal_px * fall[0] / entry.y[1])
         return lowest, least(entry.scale[1] * high, camera.focal_px * fall[1].max(0) / entry.y[0])
 
-    def scales_seen_in(self, row: int, ends: Ends) -> Range | None:
+    def scales_seen_in(self, row: int, ends: Ends) -> BallInterval | None:
         """Range of g over the points of a marking that lie in a row; None if no state of the slice shows any there.
 
         The slice must have `rows`. A point in the row is not seen below the row's lower border, nor nearer than the near end.
@@ -202,7 +202,7 @@ class Slice:
             self._scales[ends, row] = self._scales_in(row, ends)
         return self._scales[ends, row]
 
-    def _scales_in(self, row: int, ends: Ends) -> Range | None:
+    def _scales_in(self, row: int, ends: Ends) -> BallInterval | None:
         rows = self.rows(ends)
         if rows is None:
             raise ValueError("the marking is not certainly in front of the camera")
@@ -218,7 +218,7 @@ class Slice:
         high = least(high, camera.focal_px * upper[1].max(lower[1]) / ends.near[0])
         return None if low > high else (low, high)
 
-    def scales_crossed_in(self, row: int, ends: Ends) -> Range | None:
+    def scales_crossed_in(self, row: int, ends: Ends) -> BallInterval | None:
         """For a marking that every state of the slice shows in a row: each one's g starts there at or below the first number that is
         returned, and goes on to the second or above. None unless all certainly show it. The slice must have `rows`.
         """
@@ -237,13 +237,13 @@ class Slice:
         return start, stop
 
 
-def columns(camera: BallCamera, across: Range, scales: Range) -> Range:
+def columns(camera: BallCamera, across: BallInterval, scales: BallInterval) -> BallInterval:
     """Range of u = u0 + X g over X in `across` and g in `scales`."""
     products = [side * scale for side in across for scale in scales]
     return camera.u0 + products[0].min(products[1]), camera.u0 + products[2].max(products[3])
 
 
-def columns_crossed(camera: BallCamera, across: Range, scales: Range) -> Range:
+def columns_crossed(camera: BallCamera, across: BallInterval, scales: BallInterval) -> BallInterval:
     """A path goes from u0 + X g_start to u0 + X g_stop, g_start <= scales[0], g_stop >= scales[1], both above 0, X in `across`.
 
     Returns a bound above each path's smaller end and one below each path's greater end.

@@ -52,7 +52,7 @@ class _CellProver:
     def __init__(self, claim: CellClaim) -> None:
         self.claim, self.scene = claim, claim.scene
         self.camera = BallCamera(claim.scene.camera)
-        self.reach_px = claim.scene.tolerance.line_px
+        self.line_px = claim.scene.tolerance.line_px
         self.spatial = claim.spatial.bits(claim.window, claim.cell, "S")[0]
         self.must_light = claim.must_light.bits(claim.window, claim.cell, "K")
         self.may_light = claim.may_light.bits(claim.window, claim.cell, "O")
@@ -82,8 +82,8 @@ class _CellProver:
         padding = claim.must_light_size == PADDING_SIZE
         sizes = self.must_light.sum(axis=(1, 2))
         inner = self.must_light.copy()
-        if self.reach_px > 0:
-            inner[:, self.reach_px : -self.reach_px, self.reach_px : -self.reach_px] = False
+        if self.line_px > 0:
+            inner[:, self.line_px : -self.line_px, self.line_px : -self.line_px] = False
         else:
             inner[:] = False
         faults = {

@@ -31,11 +31,11 @@ def displacement_px(scene: Scene, window: Window) -> float:
     with ctx.workprec(PRECISION_BITS):
         off, camera = scene.calibration, scene.camera
         focal = arb(camera.focal_length_m) / arb(camera.pixel_pitch_m)
-        reach, (height, width) = scene.tolerance.line_px, camera.shape
-        left = window.left - reach * (window.left == 0)
-        right = window.right + reach * (window.right == width)
-        top = window.top - reach * (window.top == 0)
-        bottom = window.bottom + reach * (window.bottom == height)
+        line_px, (height, width) = scene.tolerance.line_px, camera.shape
+        left = window.left - line_px * (window.left == 0)
+        right = window.right + line_px * (window.right == width)
+        top = window.top - line_px * (window.top == 0)
+        bottom = window.bottom + line_px * (window.bottom == height)
         across = [(side - arb(camera.u0)) / focal for side in _parts(left, right)]
         down = [(side - arb(camera.v0)) / focal for side in _parts(top, bottom)]
         yaw, roll = _sine_and_cosine(off.yaw_rad), _sine_and_cosine(off.roll_rad)

@@ -15,12 +15,12 @@ import numpy as np
 from flint import arb  # pyright: ignore[reportMissingModuleSource]
 from numpy.typing import NDArray
 
-from build_model.verify.ball_camera import BallEntry, Ends, Range, Slice, columns, columns_crossed
+from build_model.verify.ball_camera import BallEntry, BallInterval, Ends, Slice, columns, columns_crossed
 from build_model.verify.cell_claim import CellClaim
 from build_model.verify.counterexample import Counterexample, Refuted
 from build_model.window import Bits
 
-Runs = list[tuple[float, float]]
+ColumnIntervals = list[tuple[float, float]]
 """Intervals [left, right) of columns in one row."""
 FINEST_SHARE = 2.0**-44
 """A slice of theta this share of its entry's, or two steps of float64 wide, is not halved again: what is not proved there is refuted."""
@@ -35,7 +35,7 @@ class _Seen:
     """A marking as the states of an entry see it: its ends' distances, and the range of X = p_x - x."""
 
     ends: Ends
-    across: Range
+    across: BallInterval
 
 
 class EntryProver:
@@ -43,7 +43,7 @@ class EntryProver:
 
     def __init__(self, claim: CellClaim, number: int, entry: BallEntry) -> None:
         self.claim, self.number, self.camera = claim, number, entry.camera
-        self.reach_px = claim.scene.tolerance.line_px
+        self.line_px = claim.scene.tolerance.line_px
         self.margin = arb("inf")  # the least margin of the bounds that were proved, px
         self.root = Slice(entry, *entry.theta)
         self.markings = self._seen(entry)
@@ -82,13 +82,13 @@ class EntryProver:
     def prove_may_light(self, bits: Bits) -> None:
         """O: whatever a state lights lies inside `bits`, with all within `line_px`. Raises `Refuted`."""
         first, stop = self._rows()
-        runs = _allowed_runs(self.claim, bits, first, stop)
+        allowed = _allowed_columns(self.claim, bits, first, stop)
         for row, marking in itertools.product(range(first, stop), range(len(self.markings))):
             open_slices = [self.root]
             while open_slices:
                 part = open_slices.pop()
-                if not (part.empty or self._within(runs[row - first], part, row, marking)):
-                    self._seek_lit_outside(runs[row - first], part, row, marking)
+                if not (part.empty or self._within(allowed[row - first], part, row, marking)):
+                    self._seek_lit_outside(allowed[row - first], part, row, marking)
                     open_slices += part.halves()
 
     def _rows(self) -> tuple[int, int]:
@@ -106,12 +106,12 @@ class EntryProver:
                     if part.high - part.low <= self.finest_width:
                         raise self._refuted("a marking is not certainly in front of the camera", None, self._some_state(part))
                     open_slices += part.halves()
-        reach = self.reach_px
-        first, stop = max(min(lowest, default=0), -reach), min(max(highest, default=0), self.claim.scene.camera.height + reach)
+        line_px = self.line_px
+        first, stop = max(min(lowest, default=0), -line_px), min(max(highest, default=0), self.claim.scene.camera.height + line_px)
         return first, max(first, stop)
 
-    def _within(self, runs: Runs, part: Slice, row: int, marking: int) -> bool:
-        """True if the slice's columns in the row are proved to lie in one of the runs; keeps the margin."""
+    def _within(self, allowed: ColumnIntervals, part: Slice, row: int, marking: int) -> bool:
+        """True if the slice's columns in the row are proved to lie in one of the allowed intervals; keeps the margin."""
         seen = self.markings[marking]
         if part.rows(seen.ends) is None:
             return False
@@ -120,14 +120,14 @@ class EntryProver:
             return True
         low, high = columns(self.camera, seen.across, scales)
         middle = float(low + high) / 2
-        left, right = min(runs, key=lambda run: max(run[0] - middle, middle - run[1]))
+        left, right = min(allowed, key=lambda interval: max(interval[0] - middle, middle - interval[1]))
         if not (low >= left and high < right):
             return False
         self._keep_margin(low - left, right - high)
         return True
 
-    def _seek_lit_outside(self, runs: Runs, part: Slice, row: int, marking: int) -> None:
-        """Raises `Refuted` if a state of the slice lights a pixel outside the runs, or if the slice is as narrow as any."""
+    def _seek_lit_outside(self, allowed: ColumnIntervals, part: Slice, row: int, marking: int) -> None:
+        """Raises `Refuted` if a state of the slice lights a pixel outside the allowed intervals, or if the slice is as narrow as any."""
         width = part.high - part.low
         if width > max(self.search_width, self.finest_width):
             return
@@ -140,8 +140,8 @@ class EntryProver:
             smaller, greater = columns_crossed(self.camera, seen.across, scales)
             for column in {math.floor(float(side)) for side in (smaller, greater)}:
                 lit = smaller < column + 1 and greater > column
-                if lit and not any(left <= column < right for left, right in runs):
-                    near = f", with all within {self.reach_px} px," if self.reach_px else ""
+                if lit and not any(left <= column < right for left, right in allowed):
+                    near = f", with all within {self.line_px} px," if self.line_px else ""
                     raise self._refuted(f"a state of the entry lights a pixel that{near} is not in O", (row, column), state)
         if width <= self.finest_width:
             claim = f"row {row}: what a state of the entry may light is not certainly in O"
@@ -186,7 +186,7 @@ class EntryProver:
             claim = "a pixel of K is not certainly lit by every state of the entry"
             raise self._refuted(claim, (row, pixels[0]), self._some_state(part))
 
-    def _columns_seen(self, point: Slice, row: int) -> Iterator[Range]:
+    def _columns_seen(self, point: Slice, row: int) -> Iterator[BallInterval]:
         """Ranges of columns that hold whatever the markings light in the row in one state."""
         for seen in self._seen(point.entry):
             if point.rows(seen.ends) is None:
@@ -200,24 +200,24 @@ class EntryProver:
                 self.margin = margin
 
 
-def _allowed_runs(claim: CellClaim, bits: Bits, first: int, stop: int) -> list[Runs]:
-    """For rows first, ..., stop - 1: the runs [left, right) of columns where a pixel's neighbourhood, as far as it is in the frame,
-    is inside `bits`. A run that leaves the frame has an infinite side.
+def _allowed_columns(claim: CellClaim, bits: Bits, first: int, stop: int) -> list[ColumnIntervals]:
+    """For rows first, ..., stop - 1: the intervals [left, right) of columns where a pixel's neighbourhood, as far as it is in the frame,
+    is inside `bits`. One that leaves the frame has an infinite side.
     """
-    reach, window, (height, width) = claim.scene.tolerance.line_px, claim.window, claim.scene.camera.shape
-    canvas = np.ones((height + 4 * reach, width + 4 * reach), dtype=bool)
-    canvas[2 * reach : 2 * reach + height, 2 * reach : 2 * reach + width] = False
-    top, left = window.top + 2 * reach, window.left + 2 * reach
+    line_px, window, (height, width) = claim.scene.tolerance.line_px, claim.window, claim.scene.camera.shape
+    canvas = np.ones((height + 4 * line_px, width + 4 * line_px), dtype=bool)
+    canvas[2 * line_px : 2 * line_px + height, 2 * line_px : 2 * line_px + width] = False
+    top, left = window.top + 2 * line_px, window.left + 2 * line_px
     canvas[top : top + bits.shape[0], left : left + bits.shape[1]] = bits
-    band, span = canvas[first + reach : stop + 3 * reach], 2 * reach + 1
+    band, span = canvas[first + line_px : stop + 3 * line_px], 2 * line_px + 1
     rows = np.logical_and.reduce([band[shift : shift + stop - first] for shift in range(span)])
-    allowed = np.logical_and.reduce([rows[:, shift : shift + width + 2 * reach] for shift in range(span)])
-    steps = np.diff(np.pad(allowed, ((0, 0), (1, 1)), constant_values=True).astype(np.int8), axis=1)
-    runs = []
+    clear = np.logical_and.reduce([rows[:, shift : shift + width + 2 * line_px] for shift in range(span)])
+    steps = np.diff(np.pad(clear, ((0, 0), (1, 1)), constant_values=True).astype(np.int8), axis=1)
+    columns_of_rows = []
     for row in steps:
-        left, right = ((np.flatnonzero(row == step) - reach).tolist() for step in (1, -1))
-        runs.append(list(zip([-math.inf, *left], [*right, math.inf], strict=True)))
-    return runs
+        left, right = ((np.flatnonzero(row == step) - line_px).tolist() for step in (1, -1))
+        columns_of_rows.append(list(zip([-math.inf, *left], [*right, math.inf], strict=True)))
+    return columns_of_rows
 
 
 def _parts(root: Slice, count: int) -> Iterator[Slice]:

@@ -43,9 +43,9 @@ def defined_outputs(
     claims: list[CellClaim], row_width: int, frame: NDArray[np.uint8], missed_budget: int, extra_budget: int
 ) -> dict[str, NDArray]:
     """NN_F's outputs by their definition; the hull of a cell without a passing entry is NaN. `row_width`: entries in a row."""
-    window, reach = claims[0].window, claims[0].scene.tolerance.line_px
+    window, line_px = claims[0].window, claims[0].scene.tolerance.line_px
     lit = frame.astype(bool)
-    wide, span, (height, width) = np.pad(lit, reach), range(2 * reach + 1), lit.shape
+    wide, span, (height, width) = np.pad(lit, line_px), range(2 * line_px + 1), lit.shape
     witnessed = np.logical_or.reduce([wide[row : row + height, column : column + width] for row in span for column in span])
     scores = [_scores(claim, lit[window.slices], witnessed[window.slices]) for claim in claims]
     passes = [(missed <= missed_budget) & ((extra <= extra_budget) | (extra_budget < 0)) for missed, extra in scores]

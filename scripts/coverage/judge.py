@@ -115,7 +115,7 @@ def judged_states(picture: Picture, missed: int, extra: int, runway: bool) -> li
         if not stage.contains(state):
             continue
         image, seen = image_of(stage.view, state), image_of(picture.camera, state).frame
-        if stage.unwitnessed(image, picture.frame) <= missed and (extra < 0 or claimed_by_none(picture, state) <= extra):
+        if stage.unwitnessed(image, picture.frame) <= missed and (extra < 0 or extra_pixels(picture, state) <= extra):
             judged.append(Judged(state, seen & picture.frame))
     return judged
 
@@ -125,7 +125,7 @@ def pixels_lost(judged: Judged, estimate: Estimate) -> int:
     return int((judged.lit & (estimate.filtered == 0)).sum())
 
 
-def claimed_by_none(picture: Picture, state: RationalState) -> int:
+def extra_pixels(picture: Picture, state: RationalState) -> int:
     """Lit pixels in S of a cell that holds the state, but for those within the tolerance of its image and its runway as it is seen."""
     stage = picture.stage
     own = image_of(stage.view, state).thickened(stage.scene.tolerance.line_px) | image_of(picture.camera, state).frame

@@ -72,9 +72,9 @@ class Stage:
 
     def unwitnessed(self, image: RunwayImage, frame: Frame) -> int:
         """Number of pixels of an image without a lit pixel of the frame within the tolerance; what is out of view counts as lit."""
-        reach, (height, width) = self.scene.tolerance.line_px, frame.shape
+        line_px, (height, width) = self.scene.tolerance.line_px, frame.shape
         seen = np.zeros(len(image.rows), dtype=np.bool_)
-        for down, right in itertools.product(range(-reach, reach + 1), repeat=2):
+        for down, right in itertools.product(range(-line_px, line_px + 1), repeat=2):
             rows, columns = image.rows + down, image.columns + right
             out_of_view = (rows < 0) | (rows >= height) | (columns < 0) | (columns >= width)
             seen |= out_of_view | frame[rows.clip(0, height - 1), columns.clip(0, width - 1)]

@@ -42,8 +42,8 @@ class Witnesses:
     def of(picture: Picture) -> Witnesses:
         """What is lit within the tolerance; what is out of view counts as lit."""
         scene = picture.stage.scene
-        reach, (height, width) = scene.tolerance.line_px, scene.camera.shape
-        seen = dilated(np.pad(picture.frame, reach, constant_values=True), reach)[reach : reach + height, reach : reach + width]
+        line_px, (height, width) = scene.tolerance.line_px, scene.camera.shape
+        seen = dilated(np.pad(picture.frame, line_px, constant_values=True), line_px)[line_px : line_px + height, line_px : line_px + width]
         sums = np.zeros((height, width + 1), dtype=np.int32)
         np.cumsum(seen, axis=1, out=sums[:, 1:])
         return Witnesses(scene, sums)

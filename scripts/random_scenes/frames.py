@@ -60,8 +60,8 @@ STATES: dict[str, State] = {
 def other_runway(rng: Rng, picture: Picture) -> None:
     """The runway as another state of the domain shows it, a hair to all of the domain away."""
     stage, true = picture.stage, picture.states[0].floats
-    reach = 10.0 ** rng.uniform(-3, 0) * (stage.upper - stage.lower)
-    floats = np.clip(true + rng.uniform(-1, 1, 4) * reach, stage.lower, stage.upper)
+    spread = 10.0 ** rng.uniform(-3, 0) * (stage.upper - stage.lower)
+    floats = np.clip(true + rng.uniform(-1, 1, 4) * spread, stage.lower, stage.upper)
     other = as_fixed(stage, into_domain(stage, RationalState.near(floats)))
     picture.states.append(other)
     picture.frame |= image_of(picture.camera, other).frame

@@ -173,11 +173,11 @@ def draw_plan(rng: Rng, sight: Sight) -> Plan:
     """Cells that a bank can serve: within an entry a line moves by a share of a pixel, and ends by a share of what is in view."""
     rates = Rates.of(sight)
     turned, shifted, scaled = rng.uniform(0.05, 0.35, 3)
-    reach = rng.uniform(0.05, 0.4) * rates.longest
+    end_rows = rng.uniform(0.05, 0.4) * rates.longest
     column_px = float(np.clip(scaled * rates.lever / max(rates.outermost, 1e-12), 0.01, 10))
     lateral_px = float(np.clip(shifted / rates.growth, 0.01, 10))
     with np.errstate(divide="ignore"):
-        ends = reach / rates.ends
+        ends = end_rows / rates.ends
     altitude_step = sight.outlook.y * column_px / (rates.lever * rates.reference_scale)
     steps = [min(turned / max(rates.line, 1e-12), ends[0]), lateral_px / rates.reference_scale, min(altitude_step, ends[1]), ends[2]]
     counts = np.array([1, 1, 1, 1] if sight.few_sets else draw_counts(rng))
@@ -276,26 +276,26 @@ def draw_tolerance(rng: Rng) -> Tolerance:
 
 def draw_calibration(rng: Rng, scene: Scene) -> Calibration:
     """Bounds that use up the tolerance, in one of the calibration's numbers or in all."""
-    reach = scene.tolerance.line_px
-    if reach == 0 or rng.random() < 0.2:
+    line_px = scene.tolerance.line_px
+    if line_px == 0 or rng.random() < 0.2:
         return Calibration()
     shares = rng.random(4) if rng.random() < 0.5 else np.eye(4)[rng.integers(4)]
     most = shares * [0.1, 0.1, 0.2, 2.0]
     window = window_in_view(scene)
-    wide = Window(window.top - reach, window.bottom + reach, window.left - reach, window.right + reach)
+    wide = Window(window.top - line_px, window.bottom + line_px, window.left - line_px, window.right + line_px)
     low, high = 0.0, 1.0
     for _ in range(30):
         middle = (low + high) / 2
         low, high = (
-            (middle, high) if moves_within(replace(scene, calibration=Calibration(*(middle * most))), wide, reach) else (low, middle)
+            (middle, high) if moves_within(replace(scene, calibration=Calibration(*(middle * most))), wide, line_px) else (low, middle)
         )
     return Calibration(*(float(value) for value in low * BOUNDS_USED * most))
 
 
-def moves_within(scene: Scene, window: Window, reach_px: float) -> bool:
-    """True if the calibration moves nothing in the window by more than the reach."""
+def moves_within(scene: Scene, window: Window, most_px: float) -> bool:
+    """True if the calibration moves nothing in the window by more than `most_px`."""
     try:
-        return displacement_px(scene, window) <= reach_px
+        return displacement_px(scene, window) <= most_px
     except SceneError:
         return False
 

@@ -1,15 +1,8 @@
-"""Pairs of bounds, and the methods by which they are found."""
+"""The methods by which a cell's pixels are bounded, for the comparison of spatial filters."""
 
 from __future__ import annotations
 
 from enum import StrEnum
-
-import numpy as np
-from numpy.typing import NDArray
-
-Floats = NDArray[np.float64]
-Bounds = tuple[Floats, Floats]
-"""Lower and upper bounds, two arrays of one shape."""
 
 
 class Method(StrEnum):
