@@ -44,7 +44,7 @@ def history_of(*moments: tuple[float | None, float | None, float | None, float |
 def panel_parts(picture: NDArray) -> list[NDArray]:
     """The picture's panels, without the legend above, the time below and the names at the left."""
     height = picture.shape[0]
-    top, bottom = int(0.09 * height), int(0.89 * height)
+    top, bottom = int(0.09 * height), int(0.905 * height)
     return np.array_split(picture[top:bottom, 100:], PANELS)
 
 
