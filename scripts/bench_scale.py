@@ -26,7 +26,7 @@ from rich.table import Table
 from build_model.export import export_model
 from runtime import Estimator, Scene, terminal
 from runtime.recordings.bench import cluttered_frames, machine
-from runtime.recordings.chart import BLUE, FONT_PT, INK, PALE, RED, new_figure, picture_of, rgb, style_axes
+from runtime.recordings.chart import BLUE, FONT_PT, INK, PALE, RED, new_figure, picture_of, rgb, style_axes, with_own_settings
 from runtime.recordings.draw import Picture, png
 from runtime.scene import Axis, Bank, Domain, EstimatorTraining
 from runtime.whole_file import write_whole
@@ -103,6 +103,7 @@ def look_ups(path: Path) -> int:
     return sum(int(np.prod(tensor.dims)) for tensor in onnx.load(path).graph.initializer if tensor.name.startswith("runs_"))
 
 
+@with_own_settings
 def scale_chart(sizes: Sequence[Size]) -> Picture:
     """Milliseconds of `run` against cells, both axes logarithmic, a line a family from the first scene on: (height, `WIDTH_PX`, 3)."""
     figure = new_figure(HEIGHT_IN, WIDTH_PX)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 pytest.importorskip("matplotlib", reason="the extra 'pictures' is not installed")
 
+import matplotlib
 from bench_scale import Size, scale_chart
 
 from runtime.recordings.chart import BLUE, RED, new_figure, picture_of, rgb
@@ -43,7 +44,7 @@ def history_of(*moments: tuple[float | None, float | None, float | None, float |
 def panel_parts(picture: NDArray) -> list[NDArray]:
     """The picture's panels, without the legend above, the time below and the names at the left."""
     height = picture.shape[0]
-    top, bottom = int(0.09 * height), int(0.89 * height)
+    top, bottom = int(0.09 * height), int(0.905 * height)
     return np.array_split(picture[top:bottom, 100:], PANELS)
 
 
@@ -58,6 +59,17 @@ def test_a_figure_has_the_size_and_the_colours_that_were_asked_for() -> None:
     picture = picture_of(figure)
     assert (picture.dtype, picture.shape) == (np.uint8, (200, 640, 3))
     assert with_colour(picture, (10, 120, 250)).all()
+
+
+def test_a_users_own_settings_change_no_chart() -> None:
+    """As a matplotlibrc in the current folder or in the home has them; LaTeX may not even be there."""
+    history, sizes = history_of((0.5, 0.4, 0.6, None)), [Size("finer", 27, 1, 1, 1.0, 1.0, 2.0, 1.0, 1.0, 1.0)]
+    expected = draw_history(SCENE, history), scale_chart(sizes)
+    settings = {"text.usetex": True, "font.size": 40, "axes.grid": True, "axes.facecolor": "red", "lines.linestyle": ":"}
+    with matplotlib.rc_context(settings):
+        for drawn, plain in zip((draw_history(SCENE, history), scale_chart(sizes)), expected, strict=True):
+            np.testing.assert_array_equal(drawn, plain)
+        assert {name: matplotlib.rcParams[name] for name in settings} == settings
 
 
 @pytest.mark.parametrize(("kind", "colour"), [(0, STATE), (3, TRUTH)])

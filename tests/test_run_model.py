@@ -419,6 +419,18 @@ def test_without_opencv_one_line_says_what_to_install(recording):
     assert done.stderr.strip() == "run-model: the package 'cv2' is missing; pip install 'glideproof[recordings]'"
 
 
+def test_neither_the_current_folder_nor_the_home_has_a_say(recording, tmp_path):
+    """Settings of matplotlib's in the one, and no place for its cache in the other."""
+    (tmp_path / "matplotlibrc").write_text("text.usetex: True\nno.such.setting: 1\n")
+    environment = {name: value for name, value in os.environ.items() if name not in ("MPLCONFIGDIR", "XDG_CONFIG_HOME", "XDG_CACHE_HOME")}
+    environment |= {"PYTHONPATH": str(Path(__file__).parents[1]), "HOME": os.devnull}
+    program = "from runtime.recordings.cli import run_model_command; run_model_command()"
+    command = [sys.executable, "-c", program, str(MODEL), str(recording), "-o", "out", "--no-video"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert (tmp_path / "out" / "state.png").is_file()
+
+
 def test_a_real_recording_is_estimated(tmp_path):
     path = RECORDINGS / "ecpy_test1_640x480_evt3.raw"
     if not path.is_file():

@@ -1,7 +1,13 @@
-"""Charts: matplotlib's figures as pictures, through its objects alone, so that neither a window nor a global state is involved."""
+"""Charts: matplotlib's figures as pictures, through its objects alone, so that neither a window nor a global state is involved.
+
+What makes one is decorated with `with_own_settings`: a chart looks the same whoever draws it, and wherever.
+"""
 
 from __future__ import annotations
 
+from typing import Any
+
+import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -18,6 +24,12 @@ INK, PALE, BLUE, GREY, RED = (40, 40, 40), (205, 205, 205), (170, 110, 40), (160
 """Colours on white: of letters, of grids, and of what is compared."""
 FONT_PT, SMALL_PT = 9.0, 7.0
 """Letters of `FONT_PT` are 25 px high in a picture 1280 px wide: readable where a page shows it at 640."""
+
+OWN_SETTINGS: dict[Any, Any] = {name: value for name, value in matplotlib.rcParamsDefault.items() if not name.startswith("backend")}
+"""matplotlib's defaults, but for what shows windows. A user's own, from a file in the home or in the current folder, may be of any kind,
+letters by LaTeX among them."""
+with_own_settings = matplotlib.rc_context(OWN_SETTINGS)
+"""Decorator, and context, in which a chart is made and drawn."""
 
 
 def new_figure(height_in: float, width_px: int) -> Figure:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import logging
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -20,6 +21,8 @@ from runtime.whole_file import OutputError, OutputFolder
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+logging.getLogger("matplotlib").setLevel(logging.ERROR)  # it has advice on stderr, as on a home that cannot be written
 
 try:
     import typer

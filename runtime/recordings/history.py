@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from runtime.estimate import Box
-from runtime.recordings.chart import FONT_PT, new_figure, picture_of, rgb, style_axes
+from runtime.recordings.chart import FONT_PT, new_figure, picture_of, rgb, style_axes, with_own_settings
 from runtime.recordings.draw import BACKGROUND, FRAME_BORDER, NO_RUNWAY, STATE, TEXT, TRUTH, Picture
 from runtime.scene import STATE_NAMES, STATE_UNITS, Scene
 
@@ -84,6 +84,7 @@ class History:
             self._every *= 2
 
 
+@with_own_settings
 def draw_history(scene: Scene, history: History, width: int = WIDTH_PX) -> Picture:
     """State against time in s, a panel for each free axis of the domain, whose faces are marked: (height, `width`, 3)."""
     free = [axis for axis in range(4) if scene.domain.upper[axis] > scene.domain.lower[axis]]

@@ -10,7 +10,20 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from runtime.recordings.bench import Latency
-from runtime.recordings.chart import BLUE, FONT_PT, GREY, INK, PALE, RED, SMALL_PT, new_figure, picture_of, rgb, style_axes
+from runtime.recordings.chart import (
+    BLUE,
+    FONT_PT,
+    GREY,
+    INK,
+    PALE,
+    RED,
+    SMALL_PT,
+    new_figure,
+    picture_of,
+    rgb,
+    style_axes,
+    with_own_settings,
+)
 from runtime.recordings.draw import Picture
 
 WIDTH_PX = 1280
@@ -20,6 +33,7 @@ LETTERS = 110
 """Most letters on a line of small ones."""
 
 
+@with_own_settings
 def latency_chart(header: Mapping[str, str], rows: Sequence[Latency]) -> Picture:
     """Milliseconds a frame on a logarithmic scale, a panel for each kind of frames: bars to p50, marks at p99. (height, `WIDTH_PX`, 3)."""
     kinds = list(dict.fromkeys(row.frames for row in rows))
