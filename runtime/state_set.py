@@ -48,11 +48,11 @@ class StateSet:
         return len(self.theta)
 
     def __getitem__(self, index: NDArray[np.int64] | NDArray[np.bool_] | slice) -> StateSet:
-        fields = (self.theta, self.x, self.y, self.z, self.scale, self.tangent)
         if isinstance(index, slice):
-            return StateSet(*(field[index] for field in fields))
+            return StateSet(self.theta[index], self.x[index], self.y[index], self.z[index], self.scale[index], self.tangent[index])
         numbers = np.flatnonzero(index) if index.dtype == np.bool_ else index
-        return StateSet(*(field.T.take(numbers, axis=-1).T for field in fields))
+        theta, x, y, z, scale = (side.T.take(numbers, axis=1).T for side in (self.theta, self.x, self.y, self.z, self.scale))
+        return StateSet(theta, x, y, z, scale, self.tangent.take(numbers))
 
     @property
     def empty(self) -> NDArray[np.bool_]:

@@ -22,7 +22,7 @@ from runtime.refine.end_pixels import offsets_at_ends
 from runtime.refine.ends import contract_by_ends
 from runtime.refine.interval import relaxed_intersection
 from runtime.refine.lit_pixels import LitPixels
-from runtime.refine.missed import charged_windows
+from runtime.refine.missed import HalfWindows
 from runtime.refine.offsets import contract_by_offsets
 from runtime.refine.sight import Claims, Sight
 from runtime.scene import Axis, Camera, Domain, Marking, Runway, Scene, SceneError
@@ -322,7 +322,8 @@ def test_missed_pixels_are_counted_by_disjoint_dark_windows(seed: int, markings:
     low = first.T[..., None].astype(float)
     high = low + (2.0 if in_order else rng.integers(0, 4, low.shape).astype(float))
     dark = rng.random(low.shape) < dark_share
-    taken, of_halves, of_rows = charged_windows(low, high, dark)
+    windows = HalfWindows(low, high, dark)
+    taken, (of_halves, of_rows) = windows.cost(), windows.that_meet_dark_ones()
     charged = list(zip(low[dark], high[dark], strict=True))
     largest = max(
         size

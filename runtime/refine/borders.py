@@ -71,15 +71,15 @@ def across(scene: Scene, sets: StateSet) -> Interval:
 
 
 def _columns(scene: Scene, sets: StateSet, ratio: Interval, margin_px: Floats) -> Interval:
-    u0 = scene.camera.u0
     across_low, across_high = (side[:, None] for side in across(scene, sets))
     slow, fast = sets.scale[:, 0] * ratio[0], sets.scale[:, 1] * ratio[1]
-    low, other = across_low * slow, across_low * fast
-    np.minimum(low, other, out=low)
-    high = across_high * slow
-    np.maximum(high, np.multiply(across_high, fast, out=other), out=high)
-    low += u0 - margin_px
-    high += u0 + margin_px
+    first, last = across_low * slow, across_low * fast
+    low = np.minimum(first, last)
+    if (sets.x[:, 0] < sets.x[:, 1]).any():
+        first, last = across_high * slow, across_high * fast
+    high = np.maximum(first, last, out=first)
+    low += scene.camera.u0 - margin_px
+    high += scene.camera.u0 + margin_px
     return np.floor(low, out=low), np.floor(high, out=high)
 
 

@@ -83,13 +83,12 @@ class LitPixels:
 
     def row_place(self, row: Floats) -> Rows:
         """What a row adds to the place of a pixel in the flat tables; rows beyond the window are one."""
-        return (np.minimum(np.maximum(row, self.top), self.bottom) - self.top).astype(np.int64)
+        return (np.minimum(np.maximum(row, self.top), self.bottom) - (self.top + self.left * self.rows)).astype(np.int64)
 
     def column_place(self, column: Floats) -> Rows:
         """What a column adds to it; columns beyond the window are one, on either side."""
         inside = np.maximum(column, self.left)
         np.minimum(inside, self.left + len(self.canvas) - 1, out=inside)
-        inside -= self.left
         inside *= self.rows
         return inside.astype(np.int64)
 

@@ -8,6 +8,7 @@ of the k lies in a dark half-window, so what a marking shows in a row is not due
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,34 +39,52 @@ class Missed:
         if budget == 0 or not dark.any():
             refuted: Bits = np.logical_or.reduce(dark, axis=(0, 1, 2))
             return Missed(budget, budget - refuted.astype(np.int64), dark, bound_nothing)
-        row = np.flatnonzero(np.logical_or.reduce(dark, axis=(0, 1)))  # of a set, in one number: the row's upper border has the same
-        flat = [side.reshape(len(side), -1) for side in borders.columns]
-        low, high = (np.array([side.take(row, axis=1), side.take(row + sets, axis=1)]) for side in flat)
-        taken, of_halves, of_rows = charged_windows(low, high, dark.reshape(2, len(flat[0]), -1).take(row, axis=2))
+        markings = len(borders.crossed)
+        row = np.flatnonzero(np.logical_or.reduce(dark, axis=(0, 1)))  # row and set in one number, the row's upper border's too
+        columns = [side.reshape(markings, -1) for side in borders.columns]
+        low, high = (np.array([side.take(row, axis=1), side.take(row + sets, axis=1)]) for side in columns)
+        windows = HalfWindows(low, high, dark.reshape(2, markings, -1).take(row, axis=2))
+        left = budget - np.bincount(row % sets, windows.cost(), sets).astype(np.int64)
+        kept = np.flatnonzero(left[row % sets] >= 0)
         spoiled: Bits = np.zeros(dark.shape, dtype=bool)
-        spoiled.reshape(2, len(flat[0]), -1)[..., row], bound_nothing.reshape(len(flat[0]), -1)[:, row] = of_halves, of_rows
-        left = budget - np.bincount(row % sets, taken, sets).astype(np.int64)
+        of_halves, of_rows = windows.of_rows(kept).that_meet_dark_ones()
+        spoiled.reshape(2, markings, -1)[..., row[kept]], bound_nothing.reshape(markings, -1)[:, row[kept]] = of_halves, of_rows
         return Missed(budget, left, spoiled, bound_nothing)
 
 
-def charged_windows(low: Floats, high: Floats, dark: Bits) -> tuple[NDArray[np.int64], Bits, Bits]:
-    """How many pixels the dark half-windows of a row cost, and which windows of the row meet a dark one.
+@dataclass(frozen=True)
+class HalfWindows:
+    """First and last column of the half-windows at the upper (0) and the lower (1) border of rows, (2, markings, rows) each."""
 
-    `low`, `high`: first and last column of the half-windows at the upper (0) and the lower (1) border of rows, (2, markings, rows). Returns
-    (rows,), and of the half-windows, (2, markings, rows), and of the whole windows, (markings, rows). The cost is that of pairwise disjoint
-    ones: the largest number of them where upper before lower, marking by marking, is their order from left to right.
-    """
-    markings, rows = dark.shape[1:]
-    start, stop = (np.swapaxes(side, 0, 1).reshape(-1, rows) for side in (low, high))  # marking by marking
-    charged: Bits = np.swapaxes(dark, 0, 1).reshape(-1, rows)
-    taken, end = np.zeros(rows, dtype=np.int64), np.full(rows, -np.inf)
-    for first, last, costs in zip(start, stop, charged, strict=True):
-        disjoint = costs & (first > end)
-        taken += disjoint
-        end = np.where(disjoint, last, end)
+    low: Floats
+    high: Floats
+    dark: Bits
+    """True where all states of a set light a pixel of it, and the frame shows none."""
 
-    def meets(first: Floats, last: Floats) -> Bits:
-        return np.logical_or.reduce(charged & (first[:, None] <= stop) & (start <= last[:, None]), axis=1)
+    def of_rows(self, numbers: NDArray[np.int64]) -> HalfWindows:
+        """Those of some of the rows."""
+        return HalfWindows(self.low.take(numbers, axis=2), self.high.take(numbers, axis=2), self.dark.take(numbers, axis=2))
 
-    of_halves = np.swapaxes(meets(start, stop).reshape(markings, 2, rows), 0, 1)
-    return taken, of_halves, meets(low.min(axis=0), high.max(axis=0))
+    def cost(self) -> NDArray[np.int64]:
+        """How many pairwise disjoint ones are dark in each row, (rows,).
+
+        It is the largest number of them where their order from left to right is marking by marking, upper before lower.
+        """
+        _, markings, rows = self.dark.shape
+        taken, end = np.zeros(rows, dtype=np.int64), np.full(rows, -np.inf)
+        for marking, half in itertools.product(range(markings), range(2)):
+            disjoint = self.dark[half, marking] & (self.low[half, marking] > end)
+            taken += disjoint
+            np.copyto(end, self.high[half, marking], where=disjoint)
+        return taken
+
+    def that_meet_dark_ones(self) -> tuple[Bits, Bits]:
+        """True for those that meet a dark one of their row, itself too, and the same of the rows' whole windows, (markings, rows)."""
+        _, markings, rows = self.dark.shape
+        start, stop = (side.reshape(2 * markings, rows) for side in (self.low, self.high))
+        dark: Bits = self.dark.reshape(2 * markings, rows)
+
+        def meet(first: Floats, last: Floats) -> Bits:
+            return np.logical_or.reduce(dark & (first[:, None] <= stop) & (start <= last[:, None]), axis=1)
+
+        return meet(start, stop).reshape(self.dark.shape), meet(self.low.min(axis=0), self.high.max(axis=0))
