@@ -20,6 +20,7 @@ from runtime.refine.claims import contract_by_claims, offsets_by_claims
 from runtime.refine.crossings import offsets_at_crossings
 from runtime.refine.end_pixels import offsets_at_ends
 from runtime.refine.ends import contract_by_ends
+from runtime.refine.ground import z_of_rows
 from runtime.refine.interval import relaxed_intersection
 from runtime.refine.lit_pixels import LitPixels
 from runtime.refine.missed import HalfWindows
@@ -76,7 +77,7 @@ def around(draw: st.DrawFn, value: float, width: float) -> list[float]:
 
 @st.composite
 def cases(draw: st.DrawFn) -> Case:
-    """Cameras of 32 to 320 px from 0.3 to 300 m up over one to three markings; sets up to a few pixels wide."""
+    """Cameras of 32 to 320 px from 0.3 to 300 m up over one to three markings, often side by side; sets up to a few pixels wide."""
     width, height = draw(st.integers(32, 320)), draw(st.integers(32, 240))
     camera = Camera(width, height, draw(spread(0.6, 8)) * width * 1e-5, 1e-5)
     y, slope = draw(spread(0.3, 300)), draw(spread(0.02, 3))  # of altitude over distance, at the nearest end
@@ -86,11 +87,14 @@ def cases(draw: st.DrawFn) -> Case:
     shift = draw(st.sampled_from([0.0, 1e4, -98_765.4]))
     state = RationalState.near([theta, shift, y, distance - shift])
     scale = camera.focal_px * math.cos(theta) / (distance + y * slope) / (1 + slope * math.tan(theta))  # about that there
-    markings = []
+    markings, column = [], draw(st.floats(-0.1, 1.1)) * width
     for number in range(draw(st.integers(1, 3))):
-        across = (draw(st.floats(-0.1, 1.1)) * width - camera.u0) / scale
+        across = (column - camera.u0) / scale
         start = draw(st.sampled_from([0.0, 0.0, 0.1, 0.5])) * distance
         markings.append(Marking(str(number), shift + across, shift + start, draw(spread(0.1, 30)) * distance))
+        column = draw(
+            st.one_of(st.floats(-0.1, 1.1).map(lambda share: share * width), st.sampled_from([0.5, 1.0, 2.0]).map(column.__add__))
+        )
     try:
         axes = [Axis((float(value),), 0.0) for value in state.floats]
         scene = Scene(camera, Runway(tuple(markings)), Domain(*axes), PAPER.bank)
@@ -294,7 +298,70 @@ def test_altitude_and_scale_tell_each_other(case: Case) -> None:
         assert high - low <= 1e-9 * high
 
 
-# --- what the contractors share, against naive twins ---
+# --- against naive twins ---
+
+
+def lit_within(frame: Frame, row: int, first: float, last: float) -> tuple[float, float]:
+    """First and last lit column of a window of a row; what lies outside of the frame is lit, and bounds nothing."""
+    height, width = frame.shape
+    if not 0 <= row < height:
+        return -np.inf, np.inf
+    lit = [column for column in range(max(int(first), -1), min(int(last), width) + 1) if column in (-1, width) or frame[row, column]]
+    return (
+        min(lit, default=np.inf) if 0 <= first < width else -np.inf,
+        max(lit, default=-np.inf) if 0 <= last < width else np.inf,
+    )
+
+
+@examples(60)
+@given(case=cases(), data=st.data())
+def test_offsets_at_crossings_are_those_of_a_naive_twin(case: Case, data: st.DataObject) -> None:
+    """Row by row the bounds of its two half-windows, where they are usable; of all rows the closest but for the missed pixels left."""
+    frame, missed = spoiled(case, data, 4, clutter_of(case, data))
+    sight = case.seen(frame, missed + data.draw(st.integers(0, 2)))
+    borders, u0 = sight.borders, case.scene.camera.u0
+    low, high = offsets_at_crossings(case.sets, sight)
+    for marking in range(len(low)):
+        lower, upper = [], []
+        for row in range(len(borders.row) - 1):
+            bounds = [(-np.inf, np.inf)]
+            for half in (0, 1):
+                if sight.crossed[half, marking, row, 0] and not sight.missed.halves[half, marking, row, 0]:
+                    window = (float(side[marking, row + half, 0]) for side in borders.columns)
+                    first, last = lit_within(frame, int(borders.row[row, 0]), *window)
+                    slow, fast = (float(side[row + half, 0]) for side in borders.ratio)
+                    left, right = first - u0 - borders.margin_px[0], last + 1 - u0 + borders.margin_px[0]
+                    bounds.append((min(left / slow, left / fast), max(right / slow, right / fast)))
+            lower.append(max(bound for bound, _ in bounds))
+            upper.append(min(bound for _, bound in bounds))
+        spared = int(sight.missed.left[0])
+        assert low[marking, 0] == pytest.approx([*sorted(lower, reverse=True), *[-np.inf] * spared][spared], rel=1e-9, abs=1e-9)
+        assert high[marking, 0] == pytest.approx([*sorted(upper), *[np.inf] * spared][spared], rel=1e-9, abs=1e-9)
+
+
+@examples(60)
+@given(case=cases(), data=st.data())
+def test_ends_are_those_of_a_naive_twin(case: Case, data: st.DataObject) -> None:
+    """Row by row from the far end down, and from the near end up: a marking ends where one more is dark than may be missed."""
+    frame, missed = spoiled(case, data, 4, clutter_of(case, data))
+    sight = case.seen(frame, missed + data.draw(st.integers(0, 2)))
+    borders, (first, last) = sight.borders, sight.borders.across_rows()
+    lowest, highest = borders.near[1].copy(), borders.far[0].copy()
+    for marking in range(len(lowest)):
+        dark_below, dark_above = [], []
+        for row, v in enumerate(borders.row[:-1, 0].tolist()):
+            shown = lit_within(frame, int(v), float(first[marking, row, 0]), float(last[marking, row, 0]))
+            if shown[0] > shown[1] and not sight.missed.rows[marking, row, 0]:
+                if v >= borders.far[1][marking, 0] and v + 1 > borders.near[0][marking, 0]:
+                    dark_below.append(v)
+                if v < borders.far[1][marking, 0] and v + 1 <= borders.near[0][marking, 0]:
+                    dark_above.insert(0, v + 1)
+        spared = int(sight.missed.left[0])
+        lowest[marking] = min([*lowest[marking], *dark_below[spared : spared + 1]])
+        highest[marking] = max([*highest[marking], *dark_above[spared : spared + 1]])
+    ends_z_m = case.scene.runway.ends_z_m
+    expected = z_of_rows(case.scene.camera, case.sets, lowest, ends_z_m[:, 0], highest, ends_z_m[:, 1])
+    assert contract_by_ends(case.sets, sight).z.tolist() == case.sets.contracted(z=expected).z.tolist()
 
 
 @given(seed=st.integers(0, 10_000), most=st.integers(0, 4), shape=st.tuples(st.integers(1, 3), st.integers(1, 6), st.integers(1, 5)))
