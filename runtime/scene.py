@@ -13,6 +13,7 @@ import tomllib
 import types
 import typing
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,12 @@ def _demand(holds: bool, key: str, found: object, advice: str) -> None:
         text = str(found)
         quoted = text if len(text) <= LONGEST_FOUND else f"{text[:LONGEST_FOUND]}..."
         raise SceneError(f"{key}: found {quoted}; {advice}")
+
+
+def _read_only(array: NDArray[Any]) -> NDArray[Any]:
+    """The array itself, from now on read-only."""
+    array.flags.writeable = False
+    return array
 
 
 @dataclass(frozen=True)
@@ -157,15 +164,25 @@ class Runway:
         _demand(len(names) > 0, "runway.markings", "none", "give at least one [[runway.markings]] table")
         _demand(len(set(names)) == len(names), "runway.markings name", names, "give each marking its own name")
 
-    @property
+    @cached_property
     def x_m(self) -> NDArray[np.float64]:
         """p_x of every marking, (markings,)."""
-        return np.array([marking.x_m for marking in self.markings])
+        return _read_only(np.array([marking.x_m for marking in self.markings]))
 
-    @property
+    @cached_property
     def ends_z_m(self) -> NDArray[np.float64]:
         """p_z of the near and the far end of every marking, (markings, 2)."""
-        return np.array([marking.ends_z_m for marking in self.markings])
+        return _read_only(np.array([marking.ends_z_m for marking in self.markings]))
+
+    @cached_property
+    def distances_z_m(self) -> NDArray[np.float64]:
+        """p_z of all ends, each once, ascending: what equal ends share is computed once."""
+        return _read_only(np.unique(self.ends_z_m))
+
+    @cached_property
+    def place_of_ends(self) -> NDArray[np.int64]:
+        """Where the near and the far end of every marking are among `distances_z_m`, (markings, 2)."""
+        return _read_only(np.searchsorted(self.distances_z_m, self.ends_z_m))
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ plain float64 bounds, which `runtime.rounding` turns outward where they are used
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -48,38 +47,46 @@ class StateSet:
     def __len__(self) -> int:
         return len(self.theta)
 
-    def __getitem__(self, index: NDArray | slice) -> StateSet:
-        return StateSet(self.theta[index], self.x[index], self.y[index], self.z[index], self.scale[index], self.tangent[index])
+    def __getitem__(self, index: NDArray[np.int64] | NDArray[np.bool_] | slice) -> StateSet:
+        if isinstance(index, slice):
+            return StateSet(self.theta[index], self.x[index], self.y[index], self.z[index], self.scale[index], self.tangent[index])
+        numbers = np.flatnonzero(index) if index.dtype == np.bool_ else index
+        theta, x, y, z, scale = (side.T.take(numbers, axis=1).T for side in (self.theta, self.x, self.y, self.z, self.scale))
+        return StateSet(theta, x, y, z, scale, self.tangent.take(numbers))
 
     @property
     def empty(self) -> NDArray[np.bool_]:
         """True for sets with an inverted interval, (sets,)."""
-        return np.logical_or.reduce([side[:, 0] > side[:, 1] for side in (self.theta, self.x, self.y, self.z, self.scale)])
+        inverted = [side[:, 0] > side[:, 1] for side in (self.theta, self.x, self.y, self.z, self.scale)]
+        return inverted[0] | inverted[1] | inverted[2] | inverted[3] | inverted[4]
 
     def contracted(self, **bounds: tuple[Floats, Floats]) -> StateSet:
         """The sets with the named intervals (any but theta's) intersected with the bounds given for them, lower and upper, (sets,) each."""
         closer = {}
         for name, (low, high) in bounds.items():
             own = getattr(self, name)
-            closer[name] = np.stack([np.maximum(own[:, 0], low), np.minimum(own[:, 1], high)], axis=-1)
-        return self._with(**closer)
+            sides = np.empty((2, len(own)))
+            np.maximum(own[:, 0], low, out=sides[0])
+            np.minimum(own[:, 1], high, out=sides[1])
+            closer[name] = sides.T
+        return self._with(closer)
 
     def emptied(self, which: NDArray[np.bool_]) -> StateSet:
         """The sets, of which those marked in `which` (sets,) are made empty: their scale gets an inverted interval, above 0."""
-        return self._with(scale=np.where(which[:, None], [2.0, 1.0], self.scale))
+        return self._with({"scale": np.where(which[:, None], [2.0, 1.0], self.scale)}) if which.any() else self
 
-    def _with(self, **fields: Floats) -> StateSet:
-        """The sets with other intervals, theta's excepted, whose sines and cosines are then not computed again."""
-        sets = replace(self, **fields)
-        for name in ("turn", "reference_fall", "condition"):
-            if name in self.__dict__:
-                sets.__dict__[name] = self.__dict__[name]
+    def _with(self, fields: dict[str, Floats]) -> StateSet:
+        """The sets with other intervals, theta's excepted, of which nothing is then computed again."""
+        sets = object.__new__(StateSet)
+        sets.__dict__.update(self.__dict__)
+        sets.__dict__.update(fields)
         return sets
 
     @cached_property
     def turn(self) -> tuple[Floats, Floats]:
         """Cosine and sine of theta, (sets, 2) each."""
-        return cosine_and_sine(self.theta)
+        cosine, sine = cosine_and_sine(np.array(self.theta.T))  # lower ends side by side, then upper ones: numpy is fastest so
+        return cosine.T, sine.T
 
     @cached_property
     def reference_fall(self) -> Floats:
@@ -90,6 +97,21 @@ class StateSet:
     def condition(self) -> Floats:
         """(1 + |t_ref|) / s(theta, t_ref), at least 1, (sets,): what one rounding of the terms of s means relative to s itself."""
         return (1 + np.abs(self.tangent)) / self.reference_fall.min(axis=1)
+
+    @cached_property
+    def reference_range(self) -> tuple[Floats, Floats]:
+        """Exact range of s(theta, t_ref) over each set, (sets,) each."""
+        first, last = self.reference_fall.T
+        (cosine_low, cosine_high), (sine_low, sine_high) = self.turn[0].T, self.turn[1].T
+        peaks = (cosine_low >= sine_low * self.tangent) & (cosine_high <= sine_high * self.tangent)
+        high = np.maximum(first, last)
+        return np.minimum(first, last), np.where(peaks, np.sqrt(1 + self.tangent**2), high) if peaks.any() else high
+
+    @cached_property
+    def ratio_lines(self) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
+        """Slope and start, (sets,) each, of R = slope t + start at the lower and at the upper end of theta."""
+        slope, start = ((part / self.reference_fall).T.copy() for part in self.turn)
+        return (slope[0], start[0]), (slope[1], start[1])
 
     @property
     def lower(self) -> Floats:
@@ -146,17 +168,9 @@ def contract(camera: Camera, sets: StateSet) -> StateSet:
     return replace(contracted, y=np.stack([np.maximum(sets.y[:, 0], y_low), np.minimum(sets.y[:, 1], y_high)], axis=-1))
 
 
-def reference_fall_range(sets: StateSet) -> tuple[Floats, Floats]:
-    """Exact range of s(theta, t_ref) over each set, (sets,) each."""
-    low, high = np.minimum(*sets.reference_fall.T), np.maximum(*sets.reference_fall.T)
-    (cosine_low, cosine_high), (sine_low, sine_high) = sets.turn[0].T, sets.turn[1].T
-    peaks = (cosine_low >= sine_low * sets.tangent) & (cosine_high <= sine_high * sets.tangent)
-    return low, np.where(peaks, np.sqrt(1 + sets.tangent**2), high) if peaks.any() else high
-
-
 def altitude_range(camera: Camera, sets: StateSet) -> tuple[Floats, Floats]:
     """Range of y = F s(theta, t_ref) / scale over theta and scale alone, (sets,) each."""
-    low, high = reference_fall_range(sets)
+    low, high = sets.reference_range
     return camera.focal_px * low / sets.scale[:, 1], camera.focal_px * high / sets.scale[:, 0]
 
 
@@ -168,37 +182,35 @@ def end_rows(camera: Camera, sets: StateSet, end_z_m: ArrayLike) -> tuple[Floats
     negative for all altitudes that theta and scale allow, the row falls in theta and in the scale, which bounds it far more closely.
     Both bounds hold; the closer one is returned.
     """
-    end = np.asarray(end_z_m, dtype=np.float64)
-
-    def beside(values: Floats) -> Floats:
-        return values.reshape(-1, *[1] * end.ndim)
-
-    near, far = beside(sets.z[:, 0]) + end, beside(sets.z[:, 1]) + end
-    y_flat, y_steep = (camera.focal_px * sets.reference_fall[:, side] / sets.scale[:, side] for side in (0, 1))
-    slope = np.minimum(beside(np.maximum(sets.y[:, 1], altitude_range(camera, sets)[1])) / near, 1.0)
+    end = np.asarray(end_z_m, dtype=np.float64)[..., None]  # sets come last: numpy is fastest along them
+    near, far = sets.z[:, 0] + end, sets.z[:, 1] + end
+    lowest, highest = sets.y.T
+    (cosine, other_cosine), (sine, other_sine) = sets.turn[0].T, sets.turn[1].T
+    y_flat, y_steep = (camera.focal_px * sets.reference_fall / sets.scale).T
+    slope = np.minimum(np.maximum(highest, altitude_range(camera, sets)[1]) / near, 1.0)
     # sin(beta) cos(beta) = slope / (1 + slope^2), which rises up to slope 1
-    cotangent = (sets.turn[0][:, 0] - sets.turn[1][:, 0] * sets.tangent) / sets.reference_fall[:, 0]
-    falls = slope * np.maximum(beside(cotangent), 0) < 1 + slope**2
+    cotangent = (cosine - sine * sets.tangent) / sets.reference_fall[:, 0]
+    falls = slope * np.maximum(cotangent, 0) < 1 + slope**2
     # The row rises in y: where both bounds hold, the closer one is that of the larger or smaller of the two altitudes.
     # No farther out than the set's own altitudes go: what lies beyond them may be behind the camera.
-    y_low = np.where(falls, beside(np.clip(y_steep, *sets.y.T)), beside(sets.y[:, 0]))
-    y_high = np.where(falls, beside(np.clip(y_flat, *sets.y.T)), beside(sets.y[:, 1]))
-    low = _row(camera, sets, 1, y_low, far, beside)
-    return low, _row(camera, sets, 0, y_high, near, beside)
+    y_low = np.where(falls, np.minimum(np.maximum(y_steep, lowest), highest), lowest)
+    y_high = np.where(falls, np.minimum(np.maximum(y_flat, lowest), highest), highest)
+    return _row(camera, other_cosine, other_sine, y_low, far).T, _row(camera, cosine, sine, y_high, near).T
 
 
-def _row(camera: Camera, sets: StateSet, side: int, y: Floats, d: Floats, beside: Callable[[Floats], Floats]) -> Floats:
-    """`row_of_point` at the lower (0) or upper (1) theta of each set."""
-    cosine, sine = beside(sets.turn[0][:, side]), beside(sets.turn[1][:, side])
+def _row(camera: Camera, cosine: Floats, sine: Floats, y: Floats, d: Floats) -> Floats:
+    """`row_of_point` at the pitch with this cosine and sine."""
     return camera.v0 + camera.focal_px * (y * cosine - d * sine) / (y * sine + d * cosine)
 
 
 def scale_ratio(sets: StateSet, tangent: Floats) -> tuple[Floats, Floats]:
-    """Range of R = s(theta, t) / s(theta, t_ref) over each set; `tangent` (rows, sets). Below the horizon R > 0: bounds stop at 0."""
-    (cosine, sine), reference = sets.turn, sets.reference_fall
-    (slope, other_slope), (start, other_start) = (cosine / reference).T, (sine / reference).T
-    first, second = tangent * slope + start, tangent * other_slope + other_start
-    return np.maximum(np.minimum(first, second), 0), np.maximum(np.maximum(first, second), 0)
+    """Range of R = s(theta, t) / s(theta, t_ref) over each set; `tangent` (..., sets). Below the horizon R > 0: bounds stop at 0."""
+    (slope, start), (other_slope, other_start) = sets.ratio_lines
+    first, second = tangent * slope, tangent * other_slope
+    first += start
+    second += other_start
+    low, high = np.minimum(first, second), np.maximum(first, second, out=first)
+    return np.maximum(low, 0, out=low), np.maximum(high, 0, out=high)
 
 
 def scale_between(camera: Camera, sets: StateSet, start: Floats, stop: Floats) -> tuple[Floats, Floats]:

@@ -112,7 +112,7 @@ def test_columns_and_distances_at_a_row_of_the_frame(sight: Sight, share: float)
         assert arb(min(sides) - margin) <= column
         assert column <= arb(max(sides) + margin)
         assert margin < 2.0**-20 + spacing(sight) * 3 * (scene.camera.width + abs(across) * sets.scale[0, 1])
-    nearest, farthest = ground_distances(scene.camera, sets, np.array([[row]]))
+    nearest, farthest = ground_distances(scene.camera, sets, np.array([[row]]), np.array([[row]]))
     distance = arb(sight.state[2]) * reach / fall
     if distance > 0:  # a marking lies ahead
         assert arb(nearest[0, 0]) * (1 - arb(2) ** -46) <= distance  # the last rounding is left to who subtracts an end from it

@@ -30,7 +30,7 @@ from runtime.model.format import PADDING_SIZE, SIDES, STATE_BOX_TENSORS, ModelEr
 from runtime.model.limits import BELOW_HORIZON_PX, ROWS_BELOW_FRAME, largest_steps
 from runtime.rounding import OUTWARD_RELATIVE, float32_above, float32_below
 from runtime.scene import STATE_NAMES, Scene
-from runtime.state_set import StateSet, reference_fall_range, tangent_of_row
+from runtime.state_set import StateSet, tangent_of_row
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ def _contracted_scales(scene: Scene, sets: StateSet, name: str) -> NDArray[np.fl
     The file's scales may exceed that range by a step of their bins. Raises `ModelError` if they exceed it by more, or are not ordered
     above 0.
     """
-    low, high = (scene.camera.focal_px * side for side in reference_fall_range(sets))
+    low, high = (scene.camera.focal_px * side for side in sets.reference_range)
     low, high = low / sets.y[:, 1], high / sets.y[:, 0]
     step = largest_steps(scene, sets.x)
     slow, fast = sets.scale.T

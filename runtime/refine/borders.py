@@ -7,6 +7,7 @@ set's own (`ratio`), the columns in which a marking may meet it, and whether the
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -39,13 +40,23 @@ class Borders:
     def of(scene: Scene, sets: StateSet, pixels: LitPixels) -> Borders:
         """The borders between the farthest and the nearest ends; one row on either side stands for all rows out of the window."""
         near, far = _ends(scene, sets)
-        first = np.clip(np.floor(far[0].min(axis=0)), pixels.top, pixels.bottom)
-        last = np.clip(np.floor(near[1].max(axis=0)), pixels.top, pixels.bottom)
-        row = first + np.arange(int((last - first).max()) + 2, dtype=np.float64)[:, None]
+        first, last = (
+            np.minimum(np.maximum(np.floor(row), pixels.top), pixels.bottom)
+            for row in (np.minimum.reduce(far[0], axis=0), np.maximum.reduce(near[1], axis=0))
+        )
+        row = first + np.arange(int(np.maximum.reduce(last - first)) + 2, dtype=np.float64)[:, None]
         ratio = scale_ratio(sets, tangent_of_row(scene.camera, row))
-        crossed = (row > far[1][:, None]) & (row < near[0][:, None]) & (ratio[0] > 0)
+        crossed = row > far[1][:, None]
+        crossed &= row < near[0][:, None]
+        crossed &= ratio[0] > 0
         margin_px = _column_margins_px(scene, sets)
         return Borders(row, ratio, near, far, crossed, _columns(scene, sets, ratio, margin_px), margin_px)
+
+    @cached_property
+    def per_ratio(self) -> Interval:
+        """1 / R at both ends of its range, (rows + 1, sets); 1 above the horizon, where no border is crossed."""
+        low, high = self.ratio
+        return 1 / np.where(low > 0, low, 1.0), 1 / np.where(high > 0, high, 1.0)
 
     def across_rows(self) -> Interval:
         """First and last column that each marking may light in each row, (markings, rows, sets)."""
@@ -60,11 +71,16 @@ def across(scene: Scene, sets: StateSet) -> Interval:
 
 
 def _columns(scene: Scene, sets: StateSet, ratio: Interval, margin_px: Floats) -> Interval:
-    u0 = scene.camera.u0
     across_low, across_high = (side[:, None] for side in across(scene, sets))
     slow, fast = sets.scale[:, 0] * ratio[0], sets.scale[:, 1] * ratio[1]
-    low, high = np.minimum(across_low * slow, across_low * fast), np.maximum(across_high * slow, across_high * fast)
-    return np.floor(low + (u0 - margin_px)), np.floor(high + (u0 + margin_px))
+    first, last = across_low * slow, across_low * fast
+    low = np.minimum(first, last)
+    if (sets.x[:, 0] < sets.x[:, 1]).any():
+        first, last = across_high * slow, across_high * fast
+    high = np.maximum(first, last, out=first)
+    low += scene.camera.u0 - margin_px
+    high += scene.camera.u0 + margin_px
+    return np.floor(low, out=low), np.floor(high, out=high)
 
 
 def _ends(scene: Scene, sets: StateSet) -> tuple[Interval, Interval]:
@@ -73,18 +89,19 @@ def _ends(scene: Scene, sets: StateSet) -> tuple[Interval, Interval]:
     v - v0 = F tan(beta - theta), so an error of an angle grows by 1 + tan^2: that of rounding, of the altitude that a scale stands for, and
     of the distance as a sum of coordinates.
     """
-    distances = np.array(sorted(set(scene.runway.ends_z_m.flat)))
+    distances = scene.runway.distances_z_m
     focal, v0 = scene.camera.focal_px, scene.camera.v0
-    angle = sets.condition[:, None] + np.abs(distances) / (sets.z[:, :1] + distances)
-    low, high = end_rows(scene.camera, sets, distances)
-    low = below(lowered(low, angle * (focal + (low - v0) ** 2 / focal))).T
-    high = above(raised(high, angle * (focal + (high - v0) ** 2 / focal))).T
-    near, far = np.searchsorted(distances, scene.runway.ends_z_m.T)
+    along = distances[:, None]
+    angle = sets.condition + np.abs(along) / (sets.z[:, 0] + along)
+    low, high = (side.T for side in end_rows(scene.camera, sets, distances))
+    low = below(lowered(low, angle * (focal + (low - v0) ** 2 / focal)))
+    high = above(raised(high, angle * (focal + (high - v0) ** 2 / focal)))
+    near, far = scene.runway.place_of_ends.T
     return (low[near], high[near]), (low[far], high[far])
 
 
 def _column_margins_px(scene: Scene, sets: StateSet) -> Floats:
     """What a column u0 + (p_x - x) scale R that is in the frame may be off by, (sets,): R is as uncertain as s(theta, t_ref)."""
     across_low, across_high = across(scene, sets)
-    offset = np.maximum(-across_low, across_high).max(axis=0) * sets.scale[:, 1]
+    offset = np.maximum.reduce(np.maximum(-across_low, across_high), axis=0) * sets.scale[:, 1]
     return column_margin_px(sets.condition * (offset + max(abs(scene.camera.u0), abs(scene.camera.width - scene.camera.u0))))

@@ -12,28 +12,34 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.refine.borders import across
-from runtime.refine.ground import z_at_least, z_at_most
+from runtime.refine.ground import z_of_rows
 from runtime.refine.interval import Interval, relaxed_intersection
 from runtime.refine.lit_columns import LitColumns
 from runtime.refine.sight import Claims, Sight
 from runtime.state_set import StateSet
 
 
-def offsets_by_claims(sets: StateSet, sight: Sight, claims: Claims) -> Interval:
-    """Bounds on the offset (p_x - x) scale of each marking, (markings, sets), px; inverted where too many claims explain nothing."""
+def offsets_by_claims(sets: StateSet, sight: Sight) -> Interval:
+    """Bounds on the offset (p_x - x) scale of each marking, (markings, sets), px; inverted where too many claims explain nothing.
+
+    None under Theorem A.
+    """
+    claims, shape = sight.claims, sight.borders.near[0].shape
+    if claims is None:
+        return np.full(shape, -np.inf), np.full(shape, np.inf)
     borders, u0 = sight.borders, sight.scene.camera.u0
     claimed = _of_one_marking(claims, sight)
     across_low, across_high = across(sight.scene, sets)
     rises, falls = across_low[:, None] >= 0, across_high[:, None] <= 0
     high, low = claimed.first + (1 - u0 + borders.margin_px), claimed.last - (u0 + borders.margin_px)
-    slow, fast = (1 / np.where(ratio > 0, ratio, 1.0) for ratio in borders.ratio)  # above the horizon no border is crossed
+    slow, fast = borders.per_ratio
     high_start, high_stop = (np.maximum(high * slow[side], high * fast[side]) for side in (slice(-1), slice(1, None)))
     low_start, low_stop = (np.minimum(low * slow[side], low * fast[side]) for side in (slice(-1), slice(1, None)))
     usable = sight.crossed.all(axis=0) & ~claimed.dark & (rises | falls)
     high = np.where(usable, np.where(rises, high_start, high_stop), np.inf)
     low = np.where(usable, np.where(rises, low_stop, low_start), -np.inf)
     bounds = relaxed_intersection(low, high, _all_of(claims, sets), claims.extra_budget)
-    explained = claims.pixels.count(borders.row[:-1], sight.rows.window).sum(axis=(0, 1))
+    explained = claims.pixels.count(borders.row[:-1], borders.across_rows()).sum(axis=(0, 1))
     unexplained = claims.pixels.canvas.sum() - explained > claims.extra_budget
     return np.where(unexplained, np.inf, bounds[0]), np.where(unexplained, -np.inf, bounds[1])
 
@@ -49,7 +55,7 @@ def contract_by_claims(sets: StateSet, sight: Sight) -> StateSet:
         np.where(found, row, -np.inf), np.where(found, row + 1, np.inf), _all_of(claims, sets), claims.extra_budget
     )
     last, first = (np.clip(side, borders.far[0], borders.near[1]) for side in (last, first))
-    return sets.contracted(z=(z_at_least(camera, sets, first, ends_z_m[:, 1]), z_at_most(camera, sets, last, ends_z_m[:, 0])))
+    return sets.contracted(z=z_of_rows(camera, sets, first, ends_z_m[:, 1], last, ends_z_m[:, 0]))
 
 
 def _all_of(claims: Claims, sets: StateSet) -> NDArray[np.int64]:
@@ -59,9 +65,9 @@ def _all_of(claims: Claims, sets: StateSet) -> NDArray[np.int64]:
 
 def _of_one_marking(claims: Claims, sight: Sight) -> LitColumns:
     """The claimed pixels of the rows' windows, without the rows in which another marking could light one of a marking's columns."""
-    low, high = window = sight.rows.window
+    low, high = window = sight.borders.across_rows()
     shared = np.zeros(low.shape, dtype=bool)
     for left, right in itertools.permutations(range(len(low)), 2):
         shared[left] |= (low[left] <= high[right]) & (low[right] <= high[left])
     first, last = claims.pixels.nearest(sight.borders.row[:-1], window)
-    return LitColumns.marked(np.where(shared, np.inf, first), np.where(shared, -np.inf, last), window)
+    return LitColumns.found(np.where(shared, np.inf, first), np.where(shared, -np.inf, last))

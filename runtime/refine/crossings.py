@@ -2,24 +2,45 @@
 
     u(r) = u0 + (p_x - x) scale R(theta, r)  lies in the closed columns of a lit pixel of the half-window above r, and of one below r
 
-but for missed pixels. One spoils what its own row shows, on both of its borders: all but m' rows hold.
+but for missed pixels. One spoils what its own row shows, on both of its borders: all but m' rows hold. Where none may be missed, the closer
+one of the two pixels at a border is all that counts of them.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from runtime.refine.interval import Interval, relaxed_intersection
+from runtime.refine.interval import Bits, Floats, Interval, relaxed_intersection
 from runtime.refine.sight import Sight
+from runtime.state_set import StateSet
 
 
-def offsets_at_crossings(sight: Sight) -> Interval:
+def offsets_at_crossings(_: StateSet, sight: Sight) -> Interval:
     """Bounds on the offset (p_x - x) scale of each marking, (markings, sets), px."""
-    borders, halves, u0 = sight.borders, sight.halves, sight.scene.camera.u0
-    low, high = halves.first - (u0 + borders.margin_px), halves.last + (1 - u0 + borders.margin_px)
-    usable = sight.crossed & ~sight.missed.halves
-    slow, fast = (1 / np.where(ratio > 0, ratio, 1.0) for ratio in borders.ratio)  # above the horizon no border is crossed
-    slow, fast = (np.stack([side[:-1], side[1:]])[:, None] for side in (slow, fast))
-    low = np.where(usable, np.minimum(low * slow, low * fast), -np.inf).max(axis=0)
-    high = np.where(usable, np.maximum(high * slow, high * fast), np.inf).min(axis=0)
-    return relaxed_intersection(low, high, np.maximum(sight.missed.left, 0), sight.missed.budget)
+    borders, missed = sight.borders, sight.missed
+    first, last = sight.halves.first, sight.halves.last
+    if missed.budget == 0:
+        low, high = _offsets(sight, _at_borders(first, np.maximum), _at_borders(last, np.minimum), borders.per_ratio, borders.crossed)
+        return np.maximum.reduce(low, axis=1), np.minimum.reduce(high, axis=1)
+    slow, fast = (np.stack([side[:-1], side[1:]])[:, None] for side in borders.per_ratio)
+    low, high = _offsets(sight, first, last, (slow, fast), sight.crossed & ~missed.halves)
+    low, high = np.maximum(low[0], low[1]), np.minimum(high[0], high[1])
+    return relaxed_intersection(low, high, np.maximum(missed.left, 0), missed.budget)
+
+
+def _offsets(sight: Sight, first: Floats, last: Floats, per_ratio: Interval, usable: Bits) -> Interval:
+    """Bounds from a first and a last lit column each; none where they are not usable."""
+    slow, fast = per_ratio
+    none = np.where(usable, np.inf, -np.inf)
+    low, high = first - (sight.scene.camera.u0 + sight.borders.margin_px), last + (1 - sight.scene.camera.u0 + sight.borders.margin_px)
+    low, high = np.minimum(low * slow, low * fast), np.maximum(high * slow, high * fast)
+    return np.minimum(low, none, out=low), np.maximum(high, np.negative(none, out=none), out=high)
+
+
+def _at_borders(halves: Floats, closer: np.ufunc) -> Floats:
+    """The closer of what is shown above and below each border, (markings, rows + 1, sets); at the outermost ones there is one row alone."""
+    upper, lower = halves
+    both = np.empty((len(upper), upper.shape[1] + 1, upper.shape[2]))
+    both[:, 0], both[:, -1] = upper[:, 0], lower[:, -1]
+    closer(lower[:, :-1], upper[:, 1:], out=both[:, 1:-1])
+    return both

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from runtime.refine.interval import Interval
+from runtime.refine.interval import Floats, Interval
 from runtime.refine.sight import Sight
 from runtime.state_set import StateSet, scale_ratio, tangent_of_row
 
@@ -15,23 +16,35 @@ def offsets_at_ends(sets: StateSet, sight: Sight) -> Interval:
     With row b the last one that the far end may lie in, the marking has a point in it, at the end or on the border above it, whichever
     is lower; and likewise in the first row that the near end may lie in.
     """
-    borders, camera = sight.borders, sight.scene.camera
-    shape = borders.near[0].shape
-    if not (sight.missed.left == 0).any():
-        return np.full(shape, -np.inf), np.full(shape, np.inf)
-    far, near = np.floor(borders.far[1]), np.floor(borders.near[0])
-    start = tangent_of_row(camera, np.stack([np.maximum(far, borders.far[0]), borders.near[0]], axis=1))
-    stop = tangent_of_row(camera, np.stack([borders.far[1], np.minimum(near + 1, borders.near[1])], axis=1))
-    slow, fast = scale_ratio(sets, start)[0], scale_ratio(sets, stop)[1]
-    place = np.stack([far, near], axis=1) - borders.row[0]
-    inside = np.clip(place, 0, len(borders.row) - 2)
-    row = inside.astype(np.int64)
-    first, last = (np.take_along_axis(side, row, axis=1) for side in (sight.rows.first, sight.rows.last))
-    spoiled = np.take_along_axis(sight.missed.rows, row, axis=1)
-    apart = (borders.near[0] > borders.far[1])[:, None]
-    known = apart & (place == inside) & (slow > 0) & ~spoiled & (sight.missed.left == 0)
+    borders, u0 = sight.borders, sight.scene.camera.u0
+    complete = sight.missed.left == 0
+    if not complete.any():
+        return np.full(borders.near[0].shape, -np.inf), np.full(borders.near[0].shape, np.inf)
+    row = np.floor(np.array([borders.far[1], borders.near[0]]))  # (ends, markings, sets), as all that follows
+    slow, fast = _ratios(sets, sight, row)
+    place = row - borders.row[0]
+    inside = np.minimum(np.maximum(place, 0), len(borders.row) - 2)
+    at = _flat(inside, len(borders.row) - 1)
+    dark = sight.rows.dark.take(at)
+    known = (borders.near[0] > borders.far[1]) & (place == inside) & (slow > 0) & ~sight.missed.rows.take(at) & complete
     slow, fast = np.where(known, slow, 1.0), np.where(known, fast, 1.0)
-    low, high = first - (camera.u0 + borders.margin_px), last + (1 - camera.u0 + borders.margin_px)
-    low = np.where(known, np.minimum(low / slow, low / fast), -np.inf).max(axis=1)
-    high = np.where(known, np.maximum(high / slow, high / fast), np.inf).min(axis=1)
-    return low, high
+    low = np.where(dark, np.inf, sight.rows.first.take(at)) - (u0 + borders.margin_px)
+    high = np.where(dark, -np.inf, sight.rows.last.take(at)) + (1 - u0 + borders.margin_px)
+    low = np.where(known, np.minimum(low / slow, low / fast), -np.inf)
+    high = np.where(known, np.maximum(high / slow, high / fast), np.inf)
+    return np.maximum(low[0], low[1]), np.minimum(high[0], high[1])
+
+
+def _ratios(sets: StateSet, sight: Sight, row: Floats) -> Interval:
+    """Range of R where the marking is in the last row of its far end (0), and in the first one of its near end (1)."""
+    borders = sight.borders
+    start, stop = (np.maximum(row[0], borders.far[0]), borders.near[0]), (borders.far[1], np.minimum(row[1] + 1, borders.near[1]))
+    low, high = scale_ratio(sets, tangent_of_row(sight.scene.camera, np.array([start, stop])))
+    return low[0], high[1]
+
+
+def _flat(row: Floats, rows: int) -> NDArray[np.int64]:
+    """Where the rows (ends, markings, sets) of each marking and set stand in arrays (markings, rows, sets), flat."""
+    _, markings, sets = row.shape
+    first = np.arange(0, markings * rows * sets, rows * sets)[:, None] + np.arange(sets)
+    return row.astype(np.int64) * sets + first

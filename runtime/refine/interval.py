@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,15 +19,15 @@ def intersected(first: Interval, second: Interval) -> Interval:
     return np.maximum(first[0], second[0]), np.minimum(first[1], second[1])
 
 
-def quotient(low: Floats, high: Floats, divisor: Floats) -> Interval:
-    """Range of [low, high] / divisor (..., 2) where the divisor has one sign, rounded outward; no bound where it has not."""
-    near, far = divisor[..., 0], divisor[..., 1]
+def quotient(dividend: Interval, divisor: Interval) -> Interval:
+    """Range of a quotient where the divisor has one sign, rounded outward; no bound where it has not."""
+    (low, high), (near, far) = dividend, divisor
     usable = near * far > 0
     if not usable.all():
         near, far = np.where(usable, near, 1.0), np.where(usable, far, 1.0)
         low, high = np.where(usable, low, -np.inf), np.where(usable, high, np.inf)
-    sides = np.stack([low / near, low / far, high / near, high / far])
-    smallest, largest = sides.min(axis=0), sides.max(axis=0)
+    sides = low / near, low / far, high / near, high / far
+    smallest, largest = functools.reduce(np.minimum, sides), functools.reduce(np.maximum, sides)
     return lowered(smallest, np.abs(smallest)), raised(largest, np.abs(largest))
 
 
@@ -37,7 +39,7 @@ def relaxed_intersection(low: Floats, high: Floats, spoiled: NDArray[np.int64], 
     """
     most = min(most, low.shape[1])
     if most == 0:
-        return low.max(axis=1, initial=-np.inf), high.min(axis=1, initial=np.inf)
+        return np.maximum.reduce(low, axis=1, initial=-np.inf), np.minimum.reduce(high, axis=1, initial=np.inf)
     return _largest_but(low, np.minimum(spoiled, most), most), -_largest_but(-high, np.minimum(spoiled, most), most)
 
 

@@ -23,6 +23,7 @@ is a mask. Rows that no pixel of the window lies in are not looked at.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -95,7 +96,7 @@ class Refiner:
         witnesses = LitPixels.of(frame, self.window, beyond=True)
         claims = None if claimed is None else Claims(LitPixels.of(claimed, self.window, beyond=False), self.extra_budget)
         search = NONE_MISSED if self.missed_budget == 0 else NARROWED if narrowed else SOME_MISSED
-        most_sets = LARGEST_ROUND // (len(self.scene.runway.markings) * len(witnesses.canvas))
+        most_sets = LARGEST_ROUND // (len(self.scene.runway.markings) * witnesses.rows)
         slices = min(max(most_sets // max(len(entries), 1), 1), search.first)
         a_face = min(max(most_sets // (FACES * search.theta * search.z * search.scale), 1), search.pieces)
         pieces = self._contracted(witnesses, claims, _cut(entries, theta=slices))
@@ -111,7 +112,7 @@ class Refiner:
 
     def _contracted(self, witnesses: LitPixels, claims: Claims | None, sets: StateSet) -> StateSet:
         """The sets without most of the states that the frame contradicts, and without empty sets."""
-        size = max(LARGEST_BLOCK // (len(self.scene.runway.markings) * len(witnesses.canvas)), 1)
+        size = max(LARGEST_BLOCK // (len(self.scene.runway.markings) * witnesses.rows), 1)
         blocks = (sets[first : first + size] for first in range(0, max(len(sets), 1), size))
         return joined(*(self._contracted_block(witnesses, claims, block) for block in blocks))
 
@@ -121,22 +122,33 @@ class Refiner:
             return sets
         sets = contract_by_altitude(self.scene.camera, sets)
         sight = Sight.of(self.scene, sets, witnesses, self.missed_budget, claims)
+        if self.missed_budget > 0:  # then most sets miss too many pixels, and each costs more
+            left = np.flatnonzero(sight.missed.left >= 0)
+            sets, sight = sets[left], sight.of_sets(left)
+            if len(sets) == 0:
+                return sets
         for contract in CONTRACTORS:
             sets = contract(sets, sight)
         sets = contract_by_altitude(self.scene.camera, sets)
-        return sets[~sets.empty]
+        empty = sets.empty
+        return sets[~empty] if empty.any() else sets
 
 
 def _cut(sets: StateSet, **parts: int) -> StateSet:
     """A copy with every set cut into equal parts along the named axes; neighbours share their borders to the last bit."""
+    total = math.prod(parts.values())
+    pieces, cuts, outer = sets[np.arange(len(sets)).repeat(total)], {}, 1
     for axis, count in parts.items():
-        which = np.repeat(np.arange(len(sets)), count)
-        interval = getattr(sets, axis)
-        edges = interval[:, :1] + (interval[:, 1:] - interval[:, :1]) * (np.arange(count + 1) / count)
-        edges[:, -1] = interval[:, 1]
-        sides = np.stack([edges[:, :-1].ravel(), edges[:, 1:].ravel()], axis=-1)
-        sets = replace(sets[which], **{axis: sides})
-    return sets
+        if count > 1:
+            interval = getattr(sets, axis)
+            edges = interval[:, :1] + (interval[:, 1:] - interval[:, :1]) * (np.arange(count + 1) / count)
+            edges[:, -1] = interval[:, 1]
+            shape = len(sets), outer, count, total // (outer * count)
+            sides = np.empty((2, *shape))
+            sides[:] = np.array([edges[:, :-1], edges[:, 1:]])[:, :, None, :, None]
+            cuts[axis] = sides.reshape(2, -1).T
+            outer *= count
+    return replace(pieces, **cuts)
 
 
 def joined(*parts: StateSet) -> StateSet:
@@ -152,13 +164,17 @@ def _carries_a_face(sets: StateSet, pieces: int) -> Bits:
     chosen = np.zeros(len(sets), dtype=bool)
     if len(sets) <= pieces:
         return ~chosen
-    for bound in (sets.theta, sets.y, sets.z):
-        chosen[np.argsort(bound[:, 0], kind="stable")[:pieces]] = True  # ties are broken alike on every machine
-        chosen[np.argsort(-bound[:, 1], kind="stable")[:pieces]] = True
+    reach = np.empty((FACES, len(sets)))
+    for side, bound in enumerate((sets.theta, sets.y, sets.z)):
+        reach[2 * side] = bound[:, 0]
+        np.negative(bound[:, 1], out=reach[2 * side + 1])
+    farthest = reach.argsort(axis=1, kind="stable")  # ties are broken alike on every machine
+    chosen[farthest[:, :pieces]] = True
     return chosen
 
 
 def _extent(sets: StateSet) -> Floats:
     """Sides of the box around all sets, along theta, y and z; of no sets, 0."""
-    intervals = np.stack([sets.theta, sets.y, sets.z])
-    return intervals[..., 1].max(axis=1, initial=-np.inf) - intervals[..., 0].min(axis=1, initial=np.inf)
+    if len(sets) == 0:
+        return np.zeros(3)
+    return np.array([np.maximum.reduce(side[:, 1]) - np.minimum.reduce(side[:, 0]) for side in (sets.theta, sets.y, sets.z)])

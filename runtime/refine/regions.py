@@ -37,16 +37,17 @@ def connected_parts(sets: StateSet) -> list[NDArray[np.int64]]:
     """
     if len(sets) > MOST_TO_JOIN:
         return [np.arange(len(sets))]
-    bounds = np.stack([sets.theta, sets.x, sets.y, sets.z])  # axes first, so that numpy compares whole rows of pairs
-    starts_before_end = np.logical_and.reduce(bounds[:, :, None, 0] <= bounds[:, None, :, 1], axis=0)
-    touch = (starts_before_end & starts_before_end.T) | np.eye(len(sets), dtype=bool)
-    left: NDArray[np.bool_] = np.ones(len(sets), dtype=bool)
-    parts: list[NDArray[np.int64]] = []
+    touch = np.ones((len(sets), len(sets)), dtype=bool)
+    for low, high in (side.T for side in (sets.theta, sets.x, sets.y, sets.z)):
+        touch &= low[:, None] <= high
+    touch &= touch.T.copy()
+    left, parts = np.ones(len(sets), dtype=bool), []
     for first in range(len(sets)):
         if left[first]:
-            size, reached = 0, np.array([first])
-            while len(reached) > size:
-                size, reached = len(reached), np.flatnonzero(touch[reached].any(axis=0))
-            parts.append(reached)
-            left[reached] = False
+            part, newest = np.zeros(len(sets), dtype=bool), np.array([first])
+            while len(newest):
+                part[newest] = True
+                newest = np.flatnonzero(np.logical_or.reduce(touch[newest], axis=0) & ~part)
+            parts.append(np.flatnonzero(part))
+            left &= ~part
     return parts

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from runtime.refine.borders import Borders
 from runtime.refine.interval import Bits
-from runtime.refine.lit_columns import LitColumns
+from runtime.refine.lit_columns import LitColumns, at_both_borders
 from runtime.refine.lit_pixels import LitPixels
 from runtime.refine.missed import Missed
 from runtime.scene import Scene
@@ -40,6 +42,22 @@ class Sight:
     def of(scene: Scene, sets: StateSet, witnesses: LitPixels, missed_budget: int, claims: Claims | None) -> Sight:
         """Looks at the frame where the sets' markings may be."""
         borders = Borders.of(scene, sets, witnesses)
-        halves, rows = LitColumns.of_halves(witnesses, borders), LitColumns.of_rows(witnesses, borders)
-        crossed = np.stack([borders.crossed[:, :-1], borders.crossed[:, 1:]])
-        return Sight(scene, borders, halves, crossed, rows, Missed.count(missed_budget, halves, crossed, rows), claims)
+        halves, rows = LitColumns.of(witnesses, borders)
+        crossed = at_both_borders(borders.crossed)
+        return Sight(scene, borders, halves, crossed, rows, Missed.count(missed_budget, borders, halves, crossed), claims)
+
+    def of_sets(self, numbers: NDArray[np.int64]) -> Sight:
+        """What is shown of some of the sets."""
+        borders, halves, rows, missed = (_of_sets(part, numbers) for part in (self.borders, self.halves, self.rows, self.missed))
+        return Sight(self.scene, borders, halves, self.crossed.take(numbers, axis=-1), rows, missed, self.claims)
+
+
+def _of_sets(part: Any, numbers: NDArray[np.int64]) -> Any:
+    """Some of the sets of an array, whose last axis they are, and of a pair or a dataclass of such arrays."""
+    if isinstance(part, np.ndarray):
+        return part.take(numbers, axis=-1)
+    if isinstance(part, tuple):
+        return tuple(_of_sets(side, numbers) for side in part)
+    if is_dataclass(part):
+        return type(part)(*(_of_sets(getattr(part, field.name), numbers) for field in fields(part)))
+    return part
