@@ -211,3 +211,13 @@ def test_joined_sets_keep_their_order() -> None:
     both = joined(first, second)
     assert both.lower[:, 0].tolist() == [0, 0, 5]
     assert both.upper[:, 3].tolist() == [1, 1, 6]
+
+
+def test_a_frame_in_which_much_passes_is_left_as_it_is_cell_by_cell_too(estimator_of: Callable[..., Estimator]) -> None:
+    """Under Theorem B each cell is refined by itself: all of them together are bounded, not each alone."""
+    paper = estimator_of("paper")
+    estimator = Estimator.load(paper._name, missed_budget=20, extra_budget=2**31 - 1)
+    found = estimator.find(np.ones(estimator.scene.camera.shape, dtype=bool))
+    left = estimator.left_of(found)
+    assert len(left) == np.count_nonzero(found.passes) > LARGEST_START
+    assert np.bincount(np.nonzero(found.passes)[0]).max() < LARGEST_START

@@ -8,8 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.model.entries import Entries
-from runtime.refine.refiner import Refiner, joined
+from runtime.refine.refiner import LARGEST_START, Refiner, joined
 from runtime.state_set import StateSet
+
+LEAST_SEARCH = 16
+"""A cell's search costs at least as much as so many entries: with many cells, fewer entries are refined (`LARGEST_START`)."""
 
 
 def refined_by_cell(
@@ -25,10 +28,11 @@ def refined_by_cell(
     `known` cuts a cell's entries to what is known besides the frame.
     """
     alone = entries.row_cell[:, None]
-    left = [entries.all[:0]]
-    for cell in np.unique(entries.row_cell[passes.any(axis=1)]):
-        sets = entries.sets(passes & (alone == cell))
-        sets = sets if known is None else known(sets)
-        if len(sets):
-            left.append(refiner.refine(frame, sets, entries.within(int(cell), frame), known is not None))
-    return joined(*left)
+    cells = {int(cell): entries.sets(passes & (alone == cell)) for cell in np.unique(entries.row_cell[passes.any(axis=1)])}
+    if known is not None:
+        cells = {cell: known(sets) for cell, sets in cells.items()}
+    cells = {cell: sets for cell, sets in cells.items() if len(sets)}
+    if sum(len(sets) + LEAST_SEARCH for sets in cells.values()) > LARGEST_START:
+        return joined(*cells.values())
+    left = (refiner.refine(frame, sets, entries.within(cell, frame), known is not None) for cell, sets in cells.items())
+    return joined(entries.all[:0], *left)
