@@ -62,7 +62,8 @@ def test_moved_states_lie_in_the_moved_sets_and_nearly_fill_them(scene: Scene, d
     rng = np.random.default_rng(0)
     share = rng.random((len(states), 4))
     share[::2] = np.round(share[::2])
-    after = states + sides[:, 0] + share * (sides[:, 1] - sides[:, 0])
+    # Clipped, as a + (b - a) in floats may lie beyond b.
+    after = states + np.clip(sides[:, 0] + share * (sides[:, 1] - sides[:, 0]), sides[:, 0], sides[:, 1])
     domain = Box(scene.domain.lower, scene.domain.upper)
     inside = ((after >= domain.lower) & (after <= domain.upper)).all(axis=1)
     found = moved(scene.camera, sets, Displacement(*sides.T), domain)
