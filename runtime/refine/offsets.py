@@ -6,11 +6,11 @@ import functools
 
 import numpy as np
 
-from runtime.refine.claims import offsets_by_claims
 from runtime.refine.crossings import offsets_at_crossings
 from runtime.refine.end_pixels import offsets_at_ends
 from runtime.refine.interval import intersected, quotient
 from runtime.refine.sight import Sight
+from runtime.refine.vouched import offsets_by_vouched
 from runtime.rounding import lowered, raised
 from runtime.state_set import StateSet
 
@@ -21,8 +21,8 @@ def contract_by_offsets(sets: StateSet, sight: Sight) -> StateSet:
     Sets whose offsets the frame contradicts, or whose states miss too many pixels, come out empty.
     """
     bounds = [offsets_at_crossings(sight), offsets_at_ends(sets, sight)]
-    if sight.claims is not None:
-        bounds.append(offsets_by_claims(sets, sight, sight.claims))
+    if sight.vouched is not None:
+        bounds.append(offsets_by_vouched(sets, sight, sight.vouched))
     low, high = functools.reduce(intersected, bounds)
     refuted = (low > high).any(axis=0) | (sight.missed.left < 0)
     low, high = (np.where(refuted, 0.0, side).T for side in (low, high))

@@ -16,7 +16,7 @@ from runtime.state_set import StateSet
 
 
 @dataclass(frozen=True)
-class Claims:
+class Vouched:
     """Theorem B: the lit pixels of S are the runway's, but for `extra_budget` of them."""
 
     pixels: LitPixels
@@ -34,12 +34,12 @@ class Sight:
     """Half-windows whose border the marking crosses in all states of the set, (2, markings, rows, sets)."""
     rows: LitColumns
     missed: Missed
-    claims: Claims | None
+    vouched: Vouched | None
 
     @staticmethod
-    def of(scene: Scene, sets: StateSet, witnesses: LitPixels, missed_budget: int, claims: Claims | None) -> Sight:
+    def of(scene: Scene, sets: StateSet, witnesses: LitPixels, missed_budget: int, vouched: Vouched | None) -> Sight:
         """Looks at the frame where the sets' markings may be."""
         borders = Borders.of(scene, sets, witnesses)
         halves, rows = LitColumns.of_halves(witnesses, borders), LitColumns.of_rows(witnesses, borders)
         crossed = np.stack([borders.crossed[:, :-1], borders.crossed[:, 1:]])
-        return Sight(scene, borders, halves, crossed, rows, Missed.count(missed_budget, halves, crossed, rows), claims)
+        return Sight(scene, borders, halves, crossed, rows, Missed.count(missed_budget, halves, crossed, rows), vouched)
