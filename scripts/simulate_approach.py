@@ -14,7 +14,8 @@ placed between samples by linear interpolation; a pixel fires at most once a sam
 light, or that of a neighbour within the block's motion, is a threshold away from their level: the others cannot fire. Where footprints
 are larger than the texture's grain, far above the runway, this may miss an event.
 
-Writes approach.raw (Prophesee EVT3), approach.npz and truth.csv: the state in the middle of every window, from the first event on.
+Writes approach.raw (Prophesee EVT3), approach.npz, truth.csv: the state in the middle of every window, from the first event on; and
+attitude.csv: what an attitude reference would say, for `run-model --track --attitude`.
 At the defaults the windows are the paper's 1320 images at 25 per second. Exit code 2 if something given cannot be used.
 """
 
@@ -32,6 +33,7 @@ import cv2
 import numpy as np
 import typer
 from approach import approach_states
+from attitude_reference import AttitudeReference, attitude_text
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
@@ -364,6 +366,12 @@ def truth_text(starts_us: NDArray[np.int64], states: Floats) -> str:
     return text.getvalue()
 
 
+def attitudes(flight: Flight, seed: int) -> Floats:
+    """What an attitude reference says of the flight; its errors are drawn apart, so that the events do not depend on them."""
+    rng = np.random.default_rng([seed, 1])
+    return AttitudeReference().readings(lambda times: flight.states(times)[:, 0], flight.duration_us, flight.vibration.pitch_rad, rng)
+
+
 def write_raw(path: Path, events: NDArray[Any], shape: tuple[int, int]) -> None:
     """The events as Prophesee RAW, EVT3, whole or not at all."""
     import faery
@@ -379,7 +387,7 @@ def write_raw(path: Path, events: NDArray[Any], shape: tuple[int, int]) -> None:
 
 
 def simulate(scene: Scene, start_s: float, seconds: float, seed: int, out: Path, console: Console) -> None:
-    """Flies, writes the three files and prints what was recorded."""
+    """Flies, writes the four files and prints what was recorded."""
     camera = event_camera(scene, start_s, seconds, seed)
     count = -(-camera.flight.duration_us // BLOCK_US)
     packets = list(track(camera.blocks(), "flying", total=count, console=console, transient=True))
@@ -390,8 +398,9 @@ def simulate(scene: Scene, start_s: float, seconds: float, seed: int, out: Path,
     np.savez_compressed(columns, t=events["t"], x=events["x"], y=events["y"], p=events["p"])
     write_whole(out / "approach.npz", columns.getvalue())
     write_whole(out / "truth.csv", truth_text(starts, states).encode())
+    write_whole(out / "attitude.csv", attitude_text(attitudes(camera.flight, seed)).encode())
     console.print(_summary(events, len(starts), camera))
-    console.print(f"written: {out}/approach.raw, approach.npz and truth.csv", markup=False)
+    console.print(f"written: {out}/approach.raw, approach.npz, truth.csv and attitude.csv", markup=False)
 
 
 def _summary(events: NDArray[Any], windows: int, camera: EventCamera) -> Table:

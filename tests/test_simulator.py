@@ -15,6 +15,7 @@ pytest.importorskip("typer", reason="the extra 'recordings' is not installed")
 
 import derive_field
 import simulate_approach as simulator
+from attitude_reference import attitude_text
 from rich.console import Console
 
 from build_model.calibration import check_calibration
@@ -23,6 +24,7 @@ from runtime.camera import project
 from runtime.explanation import missed_pixels
 from runtime.frames import FrameStream
 from runtime.image import dilated, runway_image
+from runtime.recordings.attitude import AttitudeReadings
 from runtime.recordings.recording import read_events
 from runtime.scene import Calibration, Domain, Scene, Tolerance
 
@@ -174,7 +176,7 @@ def test_the_files_hold_the_same_events_and_the_truth_of_every_window(paper_scen
     assert rows[0] == ["time_us", "theta_rad", "x_m", "y_m", "z_m"]
     frames = list(FrameStream((480, 640), 40_000).frames([events]))
     assert [int(row[0]) for row in rows[1:]] == [start + 20_000 for start, _ in frames]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["approach.npz", "approach.raw", "truth.csv"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["approach.npz", "approach.raw", "attitude.csv", "truth.csv"]
 
 
 def test_a_part_beyond_the_approach_is_refused(paper_scene):
@@ -239,3 +241,22 @@ def test_most_windows_of_another_flight_keep_the_fields_budget(paper_scene, repo
     _, states = simulator.window_truths(camera.flight, frames[0][0])
     counted = [missed_pixels(field, frame, state, field.tolerance.line_px) for (_, frame), state in zip(frames, states, strict=True)]
     assert np.mean(np.array(counted) <= field.tolerance.missed_budget) >= 0.8
+
+
+# --- the attitude reference ---
+
+
+def test_the_attitude_references_plus_minus_holds_and_is_used(paper_scene, tmp_path):
+    flight = flight_of(paper_scene, simulator.Vibration())
+    off, plus_minus = [], 0.0
+    for seed in range(40):
+        path = tmp_path / "attitude.csv"
+        path.write_text(attitude_text(simulator.attitudes(flight, seed)))
+        readings = AttitudeReadings.load(path)
+        plus_minus = readings.plus_minus[0, 1] - flight.vibration.pitch_rad
+        error = -readings.angles[:, 1] - flight.states(readings.time_us)[:, 0]
+        assert (np.abs(error) <= plus_minus).all()
+        assert (np.abs(readings.angles[:, [0, 2]]) <= plus_minus).all()
+        off.append(error.mean())
+    assert np.abs(off).max() > 0.7 * plus_minus
+    assert np.std(off) > 0.3 * plus_minus
