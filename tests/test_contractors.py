@@ -16,7 +16,6 @@ from rational_image import RationalState, RationalView, turn
 from scenes import PAPER, examples
 
 from runtime.refine.altitude import contract_by_altitude
-from runtime.refine.claims import contract_by_claims, offsets_by_claims
 from runtime.refine.crossings import offsets_at_crossings
 from runtime.refine.end_pixels import offsets_at_ends
 from runtime.refine.ends import contract_by_ends
@@ -25,14 +24,15 @@ from runtime.refine.interval import relaxed_intersection
 from runtime.refine.lit_pixels import LitPixels
 from runtime.refine.missed import HalfWindows
 from runtime.refine.offsets import contract_by_offsets
-from runtime.refine.sight import Claims, Sight
+from runtime.refine.sight import Sight, Vouched
+from runtime.refine.vouched import contract_by_vouched, offsets_by_vouched
 from runtime.scene import Axis, Camera, Domain, Marking, Runway, Scene, SceneError
 from runtime.state_set import StateSet, end_rows, tangent_of_row
 
 Frame = NDArray[np.bool_]
 WHOLE = slice(None), slice(None)
-CONTRACTORS = {"offsets": contract_by_offsets, "claims": contract_by_claims, "ends": contract_by_ends}
-SOURCES = {"crossings": offsets_at_crossings, "end pixels": offsets_at_ends, "claims": offsets_by_claims}
+CONTRACTORS = {"offsets": contract_by_offsets, "vouched": contract_by_vouched, "ends": contract_by_ends}
+SOURCES = {"crossings": offsets_at_crossings, "end pixels": offsets_at_ends, "vouched": offsets_by_vouched}
 
 
 @dataclass(frozen=True)
@@ -57,10 +57,10 @@ class Case:
         slow, fast = sets.scale[0].tolist()
         return self.state.within(sets.lower[0], sets.upper[0]) and slow <= self.scale() <= fast
 
-    def seen(self, frame: Frame, budget: int, claimed_budget: int = -1) -> Sight:
-        """What the frame shows; with a `claimed_budget` all that is lit is claimed but for so many pixels."""
-        claims = None if claimed_budget < 0 else Claims(LitPixels.of(frame, WHOLE, beyond=False), claimed_budget)
-        return Sight.of(self.scene, self.sets, LitPixels.of(frame, WHOLE, beyond=True), budget, claims)
+    def seen(self, frame: Frame, budget: int, vouched_budget: int = -1) -> Sight:
+        """What the frame shows; with a `vouched_budget` all that is lit is vouched for but for so many pixels."""
+        vouched = None if vouched_budget < 0 else Vouched(LitPixels.of(frame, WHOLE, beyond=False), vouched_budget)
+        return Sight.of(self.scene, self.sets, LitPixels.of(frame, WHOLE, beyond=True), budget, vouched)
 
 
 def spread(low: float, high: float) -> st.SearchStrategy[float]:
@@ -137,7 +137,7 @@ def clutter_of(case: Case, data: st.DataObject) -> Frame:
     return np.random.default_rng(seed).random(case.image.shape) < density
 
 
-def claimed(case: Case, data: st.DataObject) -> tuple[Frame, int]:
+def vouched_for(case: Case, data: st.DataObject) -> tuple[Frame, int]:
     """Up to six more pixels are lit near the image: the frame, and how many."""
     near = np.flatnonzero(case.image)[:, None] + np.array([-2, -1, 1, 2])
     places = np.setdiff1d(near[(near >= 0) & (near < case.image.size)], np.flatnonzero(case.image))
@@ -163,7 +163,7 @@ def test_a_contractor_keeps_the_state_whatever_the_clutter(name: str, case: Case
 @examples(60)
 @given(case=cases(), data=st.data())
 def test_a_contractor_keeps_the_state_with_bounded_clutter(name: str, case: Case, data: st.DataObject) -> None:
-    frame, extra = claimed(case, data)
+    frame, extra = vouched_for(case, data)
     assert case.held_by(CONTRACTORS[name](case.sets, case.seen(frame, 0, extra)))
 
 
@@ -171,8 +171,8 @@ def test_a_contractor_keeps_the_state_with_bounded_clutter(name: str, case: Case
 @examples(60)
 @given(case=cases(), data=st.data())
 def test_true_offsets_lie_within_their_bounds(name: str, case: Case, data: st.DataObject) -> None:
-    frame, missed = spoiled(case, data, 3, clutter_of(case, data)) if name != "claims" else (case.image, 0)
-    sight = case.seen(frame, missed, 0 if name == "claims" else -1)
+    frame, missed = spoiled(case, data, 3, clutter_of(case, data)) if name != "vouched" else (case.image, 0)
+    sight = case.seen(frame, missed, 0 if name == "vouched" else -1)
     low, high = SOURCES[name](case.sets, sight)
     assert sight.missed.left[0] >= 0
     for marking, x_m in enumerate(case.scene.runway.x_m.tolist()):
@@ -252,11 +252,11 @@ def test_a_marking_ends_no_more_rows_beyond_the_lit_ones_than_may_be_missed(case
 
 @examples(60)
 @given(case=whole_markings())
-def test_claimed_pixels_pull_the_ends_out_to_their_rows(case: Case) -> None:
+def test_vouched_pixels_pull_the_ends_out_to_their_rows(case: Case) -> None:
     """Theorem B with nothing else lit: the near end reaches the last lit row, the far end the first."""
     wide = widened(case, z=0.2 * case.scene.runway.markings[0].length_m)
     assume((wide.sets.z[0, 0] + case.scene.runway.ends_z_m).min() > 0)
-    closer = contract_by_claims(wide.sets, wide.seen(case.image, 0, 0))
+    closer = contract_by_vouched(wide.sets, wide.seen(case.image, 0, 0))
     first, last = lit_rows(case)
     camera, (near_z, far_z) = case.scene.camera, case.scene.runway.ends_z_m[0]
     assert end_rows(camera, closer, near_z)[0][0] >= last - 1e-4
@@ -264,11 +264,11 @@ def test_claimed_pixels_pull_the_ends_out_to_their_rows(case: Case) -> None:
 
 
 @examples(60)
-@given(case=whole_markings(), name=st.sampled_from(["end pixels", "claims"]))
+@given(case=whole_markings(), name=st.sampled_from(["end pixels", "vouched"]))
 def test_lit_pixels_tell_an_offset_to_their_columns(case: Case, name: str) -> None:
-    """Of the end's row, one pixel or two; of claimed pixels, the smallest pixel of all."""
+    """Of the end's row, one pixel or two; of vouched pixels, the smallest pixel of all."""
     wide = widened(case, scale=3 * float(case.scale()) / case.scene.camera.width)
-    sight = wide.seen(case.image, 0, 0 if name == "claims" else -1)
+    sight = wide.seen(case.image, 0, 0 if name == "vouched" else -1)
     low, high = (float(side[0, 0]) for side in SOURCES[name](wide.sets, sight))
     lowest = np.flatnonzero(sight.borders.crossed[0, :, 0])[-1]
     assert high - low <= (2 + 0.1) / sight.borders.ratio[0][lowest, 0]

@@ -101,7 +101,7 @@ def test_a_consistent_state_is_never_lost(
 @examples(20)
 @given(data=st.data(), seed=st.integers(0, 1000), extra=st.integers(0, 6), missed=st.lists(st.integers(0, 10_000), max_size=2))
 def test_a_state_with_bounded_clutter_is_never_lost(scene: Scene, data: st.DataObject, seed: int, extra: int, missed: list[int]) -> None:
-    """Theorem B: all claimed pixels are the runway's but for `extra`, which lie on and around it."""
+    """Theorem B: all vouched pixels are the runway's but for `extra`, which lie on and around it."""
     sets = data.draw(state_sets(scene))
     states = states_in(scene, sets, 8, seed)
     assume(len(states) > 0)

@@ -7,9 +7,14 @@ import graphlib
 import subprocess
 import sys
 from pathlib import Path
+from types import FrameType
 
+import numpy as np
 import pytest
 from import_graph import all_imports_of, imports_of, source_of
+
+from runtime import Estimator
+from runtime.image import runway_image
 
 ROOT = Path(__file__).parents[1]
 ROOTS = (ROOT, ROOT / "scripts")
@@ -117,6 +122,35 @@ def test_the_extra_recordings_imports_at_the_top(module: str) -> None:
     assert path is not None
     functions = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.FunctionDef)]
     assert not any(isinstance(inner, ast.Import | ast.ImportFrom) for function in functions for inner in ast.walk(function))
+
+
+# --- a frame's way ---
+
+
+@pytest.mark.parametrize("extra_budget", [-1, 3])
+def test_a_frames_way_through_estimate_climbs_no_floor_twice(extra_budget: int) -> None:
+    """No module is called, over however many others, by one that it calls: read from the calls of a frame, Theorem B's too."""
+    estimator = Estimator.load(extra_budget=extra_budget)
+    frame = runway_image(estimator.scene, np.array([0.62, 0.0, 0.93, 1.71]))
+    callers: dict[str, set[str]] = {}
+
+    def note(called: FrameType, event: str, _: object) -> None:
+        caller = called.f_back and called.f_back.f_globals.get("__name__", "")
+        name = called.f_globals.get("__name__", "")
+        if event == "call" and caller and caller != name and {caller, name} <= set(CORE):
+            callers.setdefault(name, set()).add(caller)
+
+    before = sys.getprofile()
+    sys.setprofile(note)
+    try:
+        estimate = estimator.estimate(frame)
+    finally:
+        sys.setprofile(before)
+    assert estimate.certified
+    floors = list(graphlib.TopologicalSorter(callers).static_order())
+    assert floors[0] == "runtime.estimator"
+    assert {"runtime.model.entries", "runtime.refine.refiner", "runtime.refine.sight", "runtime.refine.regions"} <= set(floors)
+    assert ("runtime.refine.theorem_b" in floors) == (extra_budget >= 0)
 
 
 # --- the demonstration ---

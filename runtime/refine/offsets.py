@@ -9,15 +9,15 @@ from collections.abc import Callable
 import numpy as np
 
 from runtime.refine.borders import across
-from runtime.refine.claims import offsets_by_claims
 from runtime.refine.crossings import offsets_at_crossings
 from runtime.refine.end_pixels import offsets_at_ends
 from runtime.refine.interval import Interval, intersected, quotient
 from runtime.refine.sight import Sight
+from runtime.refine.vouched import offsets_by_vouched
 from runtime.rounding import lowered, raised
 from runtime.state_set import StateSet
 
-SOURCES: tuple[Callable[[StateSet, Sight], Interval], ...] = (offsets_at_crossings, offsets_at_ends, offsets_by_claims)
+SOURCES: tuple[Callable[[StateSet, Sight], Interval], ...] = (offsets_at_crossings, offsets_at_ends, offsets_by_vouched)
 """Each gives bounds on the offset of each marking, (markings, sets), px, that hold for all states which the frame allows."""
 
 
@@ -26,7 +26,7 @@ def contract_by_offsets(sets: StateSet, sight: Sight) -> StateSet:
 
     Sets whose offsets the frame contradicts, or whose states miss too many pixels, come out empty.
     """
-    low, high = functools.reduce(intersected, (source(sets, sight) for source in SOURCES if sight.claims or source != offsets_by_claims))
+    low, high = functools.reduce(intersected, (source(sets, sight) for source in SOURCES if sight.vouched or source != offsets_by_vouched))
     refuted = np.logical_or.reduce(low > high, axis=0) | (sight.missed.left < 0)
     offset = low, high = np.where(refuted, 0.0, low), np.where(refuted, 0.0, high)
     slow, fast = quotient(offset, across(sight.scene, sets))

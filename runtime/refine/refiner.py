@@ -10,7 +10,7 @@ sides; so does, if none may be missed, the lit pixel of an end. Beyond the rows 
 row without a usable lit pixel ends a marking, and so bounds its distance. Slices that contradict the frame are dropped; the others are cut
 finer, in the end only those that carry a face of the box.
 
-Under Theorem B the lit pixels of S (here: claimed pixels) are the runway's, but for `extra_budget` of them. A claimed pixel that only one
+Under Theorem B the lit pixels of S (here: vouched pixels) are the runway's, but for `extra_budget` of them. A vouched pixel that only one
 marking of the slice could light bounds that marking's offset by the pixel's other side, and pulls its ends out to the pixel's row.
 
 Guarantee: each state of the given entries that is consistent with the frame stays in some slice. Pixels outside the frame count as
@@ -30,16 +30,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from runtime.refine.altitude import contract_by_altitude
-from runtime.refine.claims import contract_by_claims
 from runtime.refine.ends import contract_by_ends
 from runtime.refine.interval import Bits, Floats
 from runtime.refine.lit_pixels import LitPixels
 from runtime.refine.offsets import contract_by_offsets
-from runtime.refine.sight import Claims, Sight
+from runtime.refine.sight import Sight, Vouched
+from runtime.refine.vouched import contract_by_vouched
 from runtime.scene import Scene
 from runtime.state_set import StateSet
 
-CONTRACTORS: tuple[Callable[[StateSet, Sight], StateSet], ...] = (contract_by_offsets, contract_by_claims, contract_by_ends)
+CONTRACTORS: tuple[Callable[[StateSet, Sight], StateSet], ...] = (contract_by_offsets, contract_by_vouched, contract_by_ends)
 """Each gives subsets of the sets that hold all their states which the frame allows; in the order in which one helps the next."""
 
 
@@ -85,43 +85,43 @@ class Refiner:
     window: tuple[slice, slice] = (slice(None), slice(None))
     """Rows and columns outside of which pixels count as lit, whatever the frame shows there."""
 
-    def refine(self, frame: Bits, entries: StateSet, claimed: Bits | None = None, narrowed: bool = False) -> StateSet:
+    def refine(self, frame: Bits, entries: StateSet, vouched_pixels: Bits | None = None, narrowed: bool = False) -> StateSet:
         """Slices that hold all states of `entries` which are consistent with `frame`, (height, width); none if there is none.
 
-        `frame` is dilated by the tolerance. `claimed`: the lit pixels of S, for Theorem B at tolerance 0; the entries are of one cell then.
-        `narrowed`: the entries were cut to what is known besides the frame.
+        `frame` is dilated by the tolerance. `vouched_pixels`: the lit pixels of S, for Theorem B at tolerance 0; the entries are of one
+        cell then. `narrowed`: the entries were cut to what is known besides the frame.
         """
         if len(entries) > LARGEST_START:
             return entries
         witnesses = LitPixels.of(frame, self.window, beyond=True)
-        claims = None if claimed is None else Claims(LitPixels.of(claimed, self.window, beyond=False), self.extra_budget)
+        vouched = None if vouched_pixels is None else Vouched(LitPixels.of(vouched_pixels, self.window, beyond=False), self.extra_budget)
         search = NONE_MISSED if self.missed_budget == 0 else NARROWED if narrowed else SOME_MISSED
         most_sets = LARGEST_ROUND // (len(self.scene.runway.markings) * witnesses.rows)
         slices = min(max(most_sets // max(len(entries), 1), 1), search.first)
         a_face = min(max(most_sets // (FACES * search.theta * search.z * search.scale), 1), search.pieces)
-        pieces = self._contracted(witnesses, claims, _cut(entries, theta=slices))
+        pieces = self._contracted(witnesses, vouched, _cut(entries, theta=slices))
         extent = _extent(pieces)
         for _ in range(search.rounds if len(pieces) else 0):
             outer = _carries_a_face(pieces, a_face)
-            finer = self._contracted(witnesses, claims, _cut(pieces[outer], theta=search.theta, z=search.z, scale=search.scale))
+            finer = self._contracted(witnesses, vouched, _cut(pieces[outer], theta=search.theta, z=search.z, scale=search.scale))
             pieces, before = joined(finer, pieces[~outer]), extent
             extent = _extent(pieces)
             if (extent > (1 - search.gain) * before).all():
                 break
         return pieces
 
-    def _contracted(self, witnesses: LitPixels, claims: Claims | None, sets: StateSet) -> StateSet:
+    def _contracted(self, witnesses: LitPixels, vouched: Vouched | None, sets: StateSet) -> StateSet:
         """The sets without most of the states that the frame contradicts, and without empty sets."""
         size = max(LARGEST_BLOCK // (len(self.scene.runway.markings) * witnesses.rows), 1)
         blocks = (sets[first : first + size] for first in range(0, max(len(sets), 1), size))
-        return joined(*(self._contracted_block(witnesses, claims, block) for block in blocks))
+        return joined(*(self._contracted_block(witnesses, vouched, block) for block in blocks))
 
-    def _contracted_block(self, witnesses: LitPixels, claims: Claims | None, sets: StateSet) -> StateSet:
+    def _contracted_block(self, witnesses: LitPixels, vouched: Vouched | None, sets: StateSet) -> StateSet:
         """`_contracted` for some sets at once."""
         if len(sets) == 0:
             return sets
         sets = contract_by_altitude(self.scene.camera, sets)
-        sight = Sight.of(self.scene, sets, witnesses, self.missed_budget, claims)
+        sight = Sight.of(self.scene, sets, witnesses, self.missed_budget, vouched)
         if self.missed_budget > 0:  # then most sets miss too many pixels, and each costs more
             left = np.flatnonzero(sight.missed.left >= 0)
             sets, sight = sets[left], sight.of_sets(left)

@@ -18,7 +18,7 @@ from runtime.state_set import StateSet
 
 
 @dataclass(frozen=True)
-class Claims:
+class Vouched:
     """Theorem B: the lit pixels of S are the runway's, but for `extra_budget` of them."""
 
     pixels: LitPixels
@@ -36,20 +36,20 @@ class Sight:
     """Half-windows whose border the marking crosses in all states of the set, (2, markings, rows, sets)."""
     rows: LitColumns
     missed: Missed
-    claims: Claims | None
+    vouched: Vouched | None
 
     @staticmethod
-    def of(scene: Scene, sets: StateSet, witnesses: LitPixels, missed_budget: int, claims: Claims | None) -> Sight:
+    def of(scene: Scene, sets: StateSet, witnesses: LitPixels, missed_budget: int, vouched: Vouched | None) -> Sight:
         """Looks at the frame where the sets' markings may be."""
         borders = Borders.of(scene, sets, witnesses)
         halves, rows = LitColumns.of(witnesses, borders)
         crossed = at_both_borders(borders.crossed)
-        return Sight(scene, borders, halves, crossed, rows, Missed.count(missed_budget, borders, halves, crossed), claims)
+        return Sight(scene, borders, halves, crossed, rows, Missed.count(missed_budget, borders, halves, crossed), vouched)
 
     def of_sets(self, numbers: NDArray[np.int64]) -> Sight:
         """What is shown of some of the sets."""
         borders, halves, rows, missed = (_of_sets(part, numbers) for part in (self.borders, self.halves, self.rows, self.missed))
-        return Sight(self.scene, borders, halves, self.crossed.take(numbers, axis=-1), rows, missed, self.claims)
+        return Sight(self.scene, borders, halves, self.crossed.take(numbers, axis=-1), rows, missed, self.vouched)
 
 
 def _of_sets(part: Any, numbers: NDArray[np.int64]) -> Any:

@@ -1,4 +1,4 @@
-"""Theorem B apart from Theorem A: what it claims differs from cell to cell, so that each cell's entries are refined by themselves."""
+"""Theorem B apart from Theorem A: S, whose lit pixels are vouched for, differs from cell to cell, so each cell is refined by itself."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def refined_by_cell(
 ) -> StateSet:
     """What is left of the entries that pass, (rows, width), if the lit pixels of the true cell's S are the runway's, all but e of them.
 
-    `frame`: (height, width). It is its own witness: these claims are made at tolerance 0 only. e is the refiner's `extra_budget`.
+    `frame`: (height, width). It is its own witness: pixels are vouched for at tolerance 0 only. e is the refiner's `extra_budget`.
     `known` cuts a cell's entries to what is known besides the frame.
     """
     alone = entries.row_cell[:, None]
