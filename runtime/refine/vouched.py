@@ -20,9 +20,9 @@ from runtime.state_set import StateSet
 
 
 def offsets_by_vouched(sets: StateSet, sight: Sight) -> Interval:
-    """Bounds on the offset (p_x - x) scale of each marking, (markings, sets), px; inverted where too many vouched pixels explain nothing.
+    """Bounds on the offset (p_x - x) scale of each marking, (markings, sets), px; without bounds under Theorem A.
 
-    None under Theorem A.
+    Inverted where more than `extra_budget` vouched pixels lie where no marking of the set can be.
     """
     vouched, shape = sight.vouched, sight.borders.near[0].shape
     if vouched is None:
