@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from runtime.estimate import Box, axis_number
 from runtime.refine.altitude import contract_by_altitude
-from runtime.refine.slices import rereferenced, tangent_below_horizon
+from runtime.refine.slices import rereferenced, tangents_below_horizon
 from runtime.rounding import lowered, raised
 from runtime.scene import Camera, Scene
 from runtime.state_set import StateSet
@@ -102,7 +102,7 @@ def moved(camera: Camera, sets: StateSet, by: Displacement, domain: Box) -> Stat
     if len(sets) == 0:
         return sets
     lowest = min(float(sets.theta[:, 0].min()), float(low[:, 0].min()))
-    sets = rereferenced(sets, np.array([tangent_below_horizon(camera, tangent, lowest) for tangent in sets.tangent]))
+    sets = rereferenced(sets, tangents_below_horizon(camera, sets.tangent, lowest))
     theta, x, y, z = (np.stack([low[:, axis], high[:, axis]], axis=-1) for axis in range(4))
     after = StateSet(theta, x, y, z, _moved_scale(sets, theta, y, by), sets.tangent)
     after = contract_by_altitude(camera, after)

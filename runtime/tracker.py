@@ -133,6 +133,8 @@ class Tracker:
     def _held(self) -> list[StateSet]:
         """For q = 0 to `outliers`: the states of the domain that lie in what all but q of the earlier frames leave possible now."""
         parts = [moved(self._camera, seen.sets, seen.since, self._domain) for seen in self._earlier]
+        if len(parts) == 1 and self.outliers == 0:
+            return parts
         whole = covering(self._camera, self._domain, self._camera.v0)
         theta = whole.theta
         if len(parts) > self.outliers:  # each end of theta as all but `outliers` of the parts allow it

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from flint import arb
-from hypothesis import assume, given
+from hypothesis import assume, given, reject
 from hypothesis import strategies as st
 from scenes import PAPER, Floats
 
@@ -16,7 +16,7 @@ from runtime.refine.altitude import contract_by_altitude
 from runtime.refine.borders import Borders, _column_margins_px, _ends
 from runtime.refine.ground import ground_distances
 from runtime.refine.lit_pixels import LitPixels
-from runtime.scene import Axis, Camera, Domain, Marking, Runway, Scene
+from runtime.scene import Axis, Camera, Domain, Marking, Runway, Scene, SceneError
 from runtime.state_set import StateSet, contract, scale_ratio, tangent_of_row
 
 
@@ -71,7 +71,10 @@ def sights(draw: st.DrawFn) -> Sight:
     state = np.array([theta, shift_x, y, shift_z + distance])
     marking = Marking("m", shift_x + across, -shift_z, length)
     axes = [Axis((value,), 0.0) for value in state.tolist()]
-    scene = Scene(camera, Runway((marking,)), Domain(*axes), PAPER.bank)
+    try:
+        scene = Scene(camera, Runway((marking,)), Domain(*axes), PAPER.bank)
+    except SceneError:  # too near the horizon, or too far from the origin, to be rounded safely
+        reject()
     middle = distance + draw(st.floats(0, 1)) * length
     row = float(np.round(camera.v0 + camera.focal_px * math.tan(math.atan2(y, middle) - theta)))
     sight = Sight(scene, state, row)

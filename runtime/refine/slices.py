@@ -33,15 +33,15 @@ INTERVALS = ("theta", "x", "y", "z", "scale")
 def covering(camera: Camera, box: Box, row: float) -> StateSet:
     """One set that holds all states of the box; the row its scale refers to is `row`, or lower where that is too near the horizon."""
     theta, x, y, z = (np.array([[low, high]]) for low, high in zip(box.lower, box.upper, strict=True))
-    tangent = np.array([tangent_below_horizon(camera, float(tangent_of_row(camera, row)), box.lower[0])])
+    tangent = tangents_below_horizon(camera, tangent_of_row(camera, np.array([row])), float(box.lower[0]))
     sets = StateSet(theta, x, y, z, np.array([[0.0, np.inf]]), tangent)
     return contract_by_altitude(camera, sets)
 
 
-def tangent_below_horizon(camera: Camera, tangent: float, theta_low: float) -> float:
-    """The tangent of a row, or of a lower one that is `BELOW_HORIZON_PX` below the horizon of every theta from `theta_low` on."""
+def tangents_below_horizon(camera: Camera, tangent: Floats, theta_low: float) -> Floats:
+    """The tangents of rows, (n,), or of a lower one that is `BELOW_HORIZON_PX` below the horizon of every theta from `theta_low` on."""
     cosine, sine = cosine_and_sine(np.array([[theta_low]]))
-    return max(tangent, float(BELOW_HORIZON_PX / camera.focal_px - sine[0, 0] / cosine[0, 0]))
+    return np.maximum(tangent, BELOW_HORIZON_PX / camera.focal_px - sine[0, 0] / cosine[0, 0])
 
 
 def rereferenced(sets: StateSet, tangent: Floats) -> StateSet:
@@ -79,18 +79,18 @@ def slice_edges(theta: Floats) -> Floats:
 def sliced(camera: Camera, sets: StateSet, edges: Floats, tangent: float) -> StateSet:
     """The hull of what each slice, between neighbours of `edges`, holds of the union of `sets`; an inverted set where that is nothing.
 
-    All scales refer to one row: that of `tangent`, or a lower one where the states need it (`tangent_below_horizon`). Slices are closed;
+    All scales refer to one row: that of `tangent`, or a lower one where the states need it (`tangents_below_horizon`). Slices are closed;
     what lies outside of the edges is left out.
     """
     count = len(edges) - 1
-    tangent = tangent_below_horizon(camera, tangent, float(edges[0]))
+    tangents = tangents_below_horizon(camera, np.full(count, tangent), float(edges[0]))
     meets = (sets.theta[:, :1] <= edges[1:]) & (edges[:-1] <= sets.theta[:, 1:])
     which, place = np.nonzero(meets)
     parts = sets[which]
     sides = np.stack([edges[place], edges[place + 1]], axis=-1)
     parts = replace(parts, theta=_common(parts.theta, sides))
-    parts = contract_by_altitude(camera, rereferenced(parts, np.full(len(parts), tangent)))
-    return _hulls(parts, place, count, np.full(count, tangent))
+    parts = contract_by_altitude(camera, rereferenced(parts, tangents[place]))
+    return _hulls(parts, place, count, tangents)
 
 
 def all_but(sources: Sequence[StateSet], start: StateSet, outliers: int) -> list[StateSet]:

@@ -1,0 +1,127 @@
+"""How much narrower the certified box becomes by what is known besides the frame: a pitch reference, or the frames before.
+
+    python scripts/known_besides.py [MODEL.onnx] [--frames N] [--flights N] [--seed N]
+
+Prints medians of half-widths in theta, y and z. Frames are exact images of random states with m pixels missed and clutter; the pitch is
+known to plus-minus e, its reading anywhere within. Flights are 60 frames, 25 a second, at rates that are drawn anew now and then within
+the motion's bounds; the boxes of their last 30 frames count, the frame's own beside the tracked one. Every box is asserted to hold its
+state.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from runtime import Box, Estimate, Estimator, Motion, Tracker, terminal
+from runtime.errors import fail
+from runtime.image import runway_image
+from runtime.model.format import ModelError
+
+FREE = [0, 2, 3]
+"""The axes that are shown: theta, y and z."""
+PLUS_MINUS_RAD = (0.02, 0.01, 0.005)
+BUDGETS = (0, 2, 8)
+FLIGHT_FRAMES, COUNTED, FRAME_US = 60, 30, 40_000
+TRACKED = ((0, 0, 0.1, 0.05), (2, 0, 0.02, 0.02), (2, 2, 0.02, 0.02))
+"""Budget m, pixels missed, and the largest rates of theta, rad/s, and of y and z, m/s."""
+
+Floats = NDArray[np.float64]
+
+
+def seen(estimator: Estimator, state: Floats, missed: int, clutter: float, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """A state's image with `missed` of its pixels dark, and clutter elsewhere."""
+    image = runway_image(estimator.scene, state).astype(np.bool_)
+    frame = image | (rng.random(image.shape) < clutter)
+    frame[tuple(rng.permutation(np.argwhere(image))[:missed].T)] = False
+    return frame
+
+
+def half_widths(estimate: Estimate, state: Floats) -> Floats:
+    """Those of theta, y and z. Raises AssertionError for a box that does not hold the state."""
+    box: Box | None = estimate.box
+    assert box is not None
+    assert box.contains(state), (box, state)
+    return box.half_widths[FREE]
+
+
+def with_a_pitch_reference(path: Path | None, budget: int, frames: int, clutter: float, seed: int, console: Console) -> list[Floats]:
+    """Median half-widths without a prior, and for each of `PLUS_MINUS_RAD`."""
+    estimator, rng = Estimator.load(path, missed_budget=budget), np.random.default_rng([seed, budget])
+    widths: list[list[Floats]] = [[] for _ in (None, *PLUS_MINUS_RAD)]
+    for _ in track(range(frames), f"m = {budget}", console=console, transient=True):
+        state = rng.uniform(estimator.domain.lower, estimator.domain.upper)
+        frame = seen(estimator, state, budget, clutter, rng)
+        widths[0].append(half_widths(estimator.estimate(frame), state))
+        for place, error in enumerate(PLUS_MINUS_RAD, start=1):
+            reading = state[0] + rng.uniform(-error, error)
+            prior = estimator.domain.replace(theta=(reading - error, reading + error))
+            widths[place].append(half_widths(estimator.estimate(frame, prior=prior), state))
+    return [np.median(each, axis=0) for each in widths]
+
+
+def tracked(
+    path: Path | None, budget: int, missed: int, rates: Floats, flights: int, clutter: float, seed: int, console: Console
+) -> tuple[Floats, Floats, float]:
+    """Median half-widths of the frame alone and over time, and the median ratio of their times."""
+    estimator, rng = Estimator.load(path, missed_budget=budget), np.random.default_rng([seed, budget, missed])
+    alone, followed, ratios = [], [], []
+    for _ in track(range(flights), f"m = {budget}, {missed} missed", console=console, transient=True):
+        tracker, state = Tracker(estimator, Motion(-rates, rates)), rng.uniform(estimator.domain.lower, estimator.domain.upper)
+        rate = rng.uniform(-rates, rates)
+        for number in range(FLIGHT_FRAMES):
+            frame = seen(estimator, state, missed, clutter, rng)
+            begun = time.thread_time()
+            over_time = half_widths(tracker.update(frame, number * FRAME_US), state)
+            between = time.thread_time()
+            by_itself = half_widths(estimator.estimate(frame), state)
+            if number >= FLIGHT_FRAMES - COUNTED:
+                alone.append(by_itself)
+                followed.append(over_time)
+                ratios.append((between - begun) / (time.thread_time() - between))
+            rate = rng.uniform(-rates, rates) if rng.random() < 0.1 else rate
+            after = state + rate * (1 - 1e-9) * FRAME_US / 1e6
+            outside = (after < estimator.domain.lower) | (after > estimator.domain.upper)
+            rate, state = np.where(outside, -rate, rate), np.where(outside, state, after)
+    return np.median(alone, axis=0), np.median(followed, axis=0), float(np.median(ratios))
+
+
+def main(
+    model: Annotated[Path | None, typer.Argument(help="Model that export-model wrote; by default the paper's.")] = None,
+    frames: Annotated[int, typer.Option(min=1, help="Frames for each budget.")] = 60,
+    flights: Annotated[int, typer.Option(min=1, help="Flights for each motion.")] = 10,
+    clutter: Annotated[float, typer.Option(min=0, max=1, help="Share of the pixels that clutter lights.")] = 0.02,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of states, frames and flights.")] = 0,
+) -> None:
+    """Compare certified boxes with and without what is known besides the frame."""
+    console = terminal.console()
+    try:
+        table = Table("m = missed", "no prior", *(f"pitch +-{error}" for error in PLUS_MINUS_RAD), title="a pitch reference")
+        for budget in BUDGETS:
+            rows = with_a_pitch_reference(model, budget, frames, clutter, seed, console)
+            table.add_row(str(budget), *(_text(each) for each in rows))
+        console.print(table)
+        table = Table("m", "missed", "rad/s, m/s", "frame alone", "over time", "time, ratio", title="25 frames a second")
+        for budget, missed, turn, speed in TRACKED:
+            rates = np.array([turn, 0, speed, speed])
+            alone, followed, ratio = tracked(model, budget, missed, rates, flights, clutter, seed, console)
+            table.add_row(str(budget), str(missed), f"{turn}, {speed}", _text(alone), _text(followed), f"{ratio:.2f}")
+        console.print(table)
+    except ModelError as error:
+        fail(error)
+
+
+def _text(widths: Floats) -> str:
+    return " ".join(f"{width:.4f}" for width in widths)
+
+
+if __name__ == "__main__":
+    terminal.run(main)
