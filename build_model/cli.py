@@ -38,7 +38,7 @@ DEFAULT_SCENE = Path("models/paper.toml")
 def export_model(
     scene: Annotated[Path, typer.Argument(help="Scene file (TOML).")] = DEFAULT_SCENE,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Model to write, or its folder; by default out/.")] = None,
-    estimator: Annotated[Path | None, typer.Option(help="Your own NN_e: float32 [1,1,height,width] to [1,4].")] = None,
+    estimator: Annotated[str | None, typer.Option(help="Your own NN_e: float32 [1,1,height,width] to [1,4]; or none: no NN_e.")] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the training.")] = 0,
     jobs: Annotated[int, typer.Option(min=1, help="Processes that build cells.")] = 2,
     dask: Annotated[

@@ -29,6 +29,7 @@ from onnx import TensorProto, helper
 
 from build_model.assembly import assemble
 from build_model.calibration import check_calibration
+from build_model.constant_network import constant_network
 from build_model.filter_graph import GraphWriter, filter_graph
 from build_model.filter_tables import FilterTables
 from build_model.hough_bank import CellBank, cell_bank
@@ -81,6 +82,10 @@ class _Stopwatch:
         self.seconds[name] = time.perf_counter() - start
 
 
+NO_ESTIMATOR = "none"
+"""In place of a network's file: no NN_e; `network_state` is the domain's centre."""
+
+
 def _silent(_stage: str, _done: int, _total: int, _loss: float | None) -> None:
     pass
 
@@ -97,9 +102,9 @@ def export_model(
 ) -> ExportReport:
     """Builds the scene's model and writes it to `path`, whole or not at all.
 
-    `estimator`: an ONNX file to serve as NN_e in place of a trained one. `jobs`, `dask`: who builds the cells (`build_banks`). Raises
-    `SceneError` for a scene that has no certificate, `EstimatorError` for a network that does not fit, `ClusterError` for a cluster that
-    cannot be used, OSError if the file cannot be written.
+    `estimator`: an ONNX file to serve as NN_e in place of a trained one, or `NO_ESTIMATOR`. `jobs`, `dask`: who builds the cells
+    (`build_banks`). Raises `SceneError` for a scene that has no certificate, `EstimatorError` for a network that does not fit,
+    `ClusterError` for a cluster that cannot be used, OSError if the file cannot be written.
     """
     watch = _Stopwatch()
     with watch.stage("NN_F"):
@@ -195,7 +200,9 @@ def filter_function(filter_part: onnx.GraphProto) -> Callable[[NDArray[np.uint8]
 def _state_network(
     scene: Scene, filter_part: onnx.GraphProto, estimator: str | Path | None, seed: int, progress: Progress
 ) -> tuple[onnx.GraphProto, TrainingReport | None]:
-    """NN_e as a graph: the user's, or one trained on what NN_F lets through."""
+    """NN_e as a graph: none but a constant, the user's, or one trained on what NN_F lets through."""
+    if estimator == NO_ESTIMATOR:
+        return constant_network(scene), None
     if estimator is not None:
         return user_network(scene, Path(estimator)), None
     network, report = train_state_network(scene, filter_function(filter_part), seed, progress)

@@ -18,10 +18,11 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 from scenes import OFF_BY, ONE_CELL, PAPER, SCENES
 
-from build_model.export import export_model
+from build_model.export import NO_ESTIMATOR, export_model
 from build_model.paper.paper_bound import paper_bound
 from build_model.partition import partition
 from build_model.user_network import EstimatorError, user_network
+from build_model.verify.proof import verify_model
 from runtime import Estimator
 from runtime.assumptions import assumptions
 from runtime.image import runway_image
@@ -400,3 +401,19 @@ def test_constants_of_any_kind_become_what_the_runtime_reads(tmp_path: Path) -> 
     outputs = Estimator.load(tmp_path / "model.onnx").run(np.ones((HEIGHT, WIDTH), dtype=bool))
     share = outputs["filtered"].mean() / 2
     assert outputs["network_state"] == pytest.approx(share * np.arange(1, 5), rel=1e-5)
+
+
+def test_a_model_without_an_estimator_certifies_all_the_same(tmp_path: Path, estimator_of: Callable[..., Estimator]) -> None:
+    report = export_model(ONE_CELL, tmp_path / "none.onnx", estimator=NO_ESTIMATOR)
+    assert report.training is None
+    verify_model(tmp_path / "none.onnx")
+    certifier, trained = Estimator.load(tmp_path / "none.onnx"), estimator_of("one cell")
+    centre = (ONE_CELL.domain.lower + ONE_CELL.domain.upper) / 2
+    for state in (ONE_CELL.domain.lower, centre):
+        frame = runway_image(ONE_CELL, state)
+        found, expected = certifier.estimate(frame), trained.estimate(frame)
+        assert found.box is not None
+        assert expected.box is not None
+        assert (found.box.lower.tolist(), found.box.upper.tolist()) == (expected.box.lower.tolist(), expected.box.upper.tolist())
+        np.testing.assert_allclose(found.network_state, centre, rtol=1e-7)
+        assert found.network_state[1] == ONE_CELL.domain.lower[1]
