@@ -198,6 +198,7 @@ def whole_markings(draw: st.DrawFn) -> Case:
     rows = draw(st.floats(8, height / 2)), draw(st.floats(height / 2 + 4, height - 8))
     assume((rows[0] - camera.v0) / camera.focal_px + math.tan(theta) > 0.05)
     far, near = (y / math.tan(theta + math.atan((row - camera.v0) / camera.focal_px)) for row in rows)
+    assume(near > 0.01 * y)  # ahead of the camera
     scales = [camera.focal_px / (y * math.sin(theta) + d * math.cos(theta)) for d in (far, near)]
     reach = min((width / 2 - 8) / scales[1], (rows[1] - rows[0]) / (scales[1] - scales[0]))
     across = draw(st.sampled_from([-1, 1])) * draw(st.floats(0.05, 1)) * reach
