@@ -4,8 +4,8 @@
 
 Prints medians of half-widths in theta, y and z. Frames are exact images of random states with m pixels missed and clutter; the pitch is
 known to plus-minus e, its reading anywhere within. Flights are 60 frames, 25 a second, at rates that are drawn anew now and then within
-the motion's bounds; the boxes of their last 30 frames count, the frame's own beside the tracked one. Every box is asserted to hold its
-state.
+bounds, which a tracker knows; or it is told each displacement with a plus-minus. The boxes of their last 30 frames count, the frame's own
+beside the tracked one. Every box is asserted to hold its state.
 """
 
 from __future__ import annotations
@@ -25,14 +25,19 @@ from runtime import Box, Estimate, Estimator, Motion, Tracker, terminal
 from runtime.errors import fail
 from runtime.image import runway_image
 from runtime.model.format import ModelError
+from runtime.scene import STATE_NAMES
 
 FREE = [0, 2, 3]
 """The axes that are shown: theta, y and z."""
 PLUS_MINUS_RAD = (0.02, 0.01, 0.005)
 BUDGETS = (0, 2, 8)
 FLIGHT_FRAMES, COUNTED, FRAME_US = 60, 30, 40_000
-TRACKED = ((0, 0, 0.1, 0.05), (2, 0, 0.02, 0.02), (2, 2, 0.02, 0.02))
-"""Budget m, pixels missed, and the largest rates of theta, rad/s, and of y and z, m/s."""
+RATES = np.array([0.1, 0.0, 0.05, 0.05])
+"""The largest of theta, rad/s, and of x, y and z, m/s."""
+GYROSCOPE = np.array([0.02, 0.0, 0.02, 0.02])
+"""The rates' plus-minus where they are told."""
+TRACKED = ((0, 0, None), (0, 0, GYROSCOPE), (2, 0, GYROSCOPE), (2, 2, GYROSCOPE))
+"""Budget m, pixels missed, and how well the rates are told, if they are."""
 
 Floats = NDArray[np.float64]
 
@@ -69,29 +74,37 @@ def with_a_pitch_reference(path: Path | None, budget: int, frames: int, clutter:
 
 
 def tracked(
-    path: Path | None, budget: int, missed: int, rates: Floats, flights: int, clutter: float, seed: int, console: Console
+    path: Path | None, budget: int, missed: int, plus_minus: Floats | None, flights: int, clutter: float, seed: int, console: Console
 ) -> tuple[Floats, Floats, float]:
     """Median half-widths of the frame alone and over time, and the median ratio of their times."""
     estimator, rng = Estimator.load(path, missed_budget=budget), np.random.default_rng([seed, budget, missed])
     alone, followed, ratios = [], [], []
     for _ in track(range(flights), f"m = {budget}, {missed} missed", console=console, transient=True):
-        tracker, state = Tracker(estimator, Motion(-rates, rates)), rng.uniform(estimator.domain.lower, estimator.domain.upper)
-        rate = rng.uniform(-rates, rates)
+        tracker, state = Tracker(estimator, Motion(-RATES, RATES)), rng.uniform(estimator.domain.lower, estimator.domain.upper)
+        rate, before = rng.uniform(-RATES, RATES), state
         for number in range(FLIGHT_FRAMES):
             frame = seen(estimator, state, missed, clutter, rng)
             begun = time.thread_time()
-            over_time = half_widths(tracker.update(frame, number * FRAME_US), state)
+            told = None if plus_minus is None else displacement(state - before, plus_minus * (FRAME_US / 1e6), rng)
+            over_time = half_widths(tracker.update(frame, number * FRAME_US, displacement=told), state)
             between = time.thread_time()
             by_itself = half_widths(estimator.estimate(frame), state)
             if number >= FLIGHT_FRAMES - COUNTED:
                 alone.append(by_itself)
                 followed.append(over_time)
                 ratios.append((between - begun) / (time.thread_time() - between))
-            rate = rng.uniform(-rates, rates) if rng.random() < 0.1 else rate
+            rate, before = rng.uniform(-RATES, RATES) if rng.random() < 0.1 else rate, state
             after = state + rate * (1 - 1e-9) * FRAME_US / 1e6
             outside = (after < estimator.domain.lower) | (after > estimator.domain.upper)
             rate, state = np.where(outside, -rate, rate), np.where(outside, state, after)
     return np.median(alone, axis=0), np.median(followed, axis=0), float(np.median(ratios))
+
+
+def displacement(moved: Floats, plus_minus: Floats, rng: np.random.Generator) -> dict[str, tuple[float, float]]:
+    """What is told of a displacement: an interval of that plus-minus that holds it."""
+    reading, hair = moved + rng.uniform(-1, 1, 4) * plus_minus, 1e-12
+    sides = zip(STATE_NAMES, reading - plus_minus - hair, reading + plus_minus + hair, strict=True)
+    return {name: (float(low), float(high)) for name, low, high in sides}
 
 
 def main(
@@ -109,11 +122,11 @@ def main(
             rows = with_a_pitch_reference(model, budget, frames, clutter, seed, console)
             table.add_row(str(budget), *(_text(each) for each in rows))
         console.print(table)
-        table = Table("m", "missed", "rad/s, m/s", "frame alone", "over time", "time, ratio", title="25 frames a second")
-        for budget, missed, turn, speed in TRACKED:
-            rates = np.array([turn, 0, speed, speed])
-            alone, followed, ratio = tracked(model, budget, missed, rates, flights, clutter, seed, console)
-            table.add_row(str(budget), str(missed), f"{turn}, {speed}", _text(alone), _text(followed), f"{ratio:.2f}")
+        table = Table("m", "missed", "rates told", "frame alone", "over time", "time, ratio", title="25 frames a second")
+        for budget, missed, plus_minus in TRACKED:
+            alone, followed, ratio = tracked(model, budget, missed, plus_minus, flights, clutter, seed, console)
+            told = "no" if plus_minus is None else f"+-{plus_minus[0]} rad/s, {plus_minus[2]} m/s"
+            table.add_row(str(budget), str(missed), told, _text(alone), _text(followed), f"{ratio:.2f}")
         console.print(table)
     except ModelError as error:
         fail(error)

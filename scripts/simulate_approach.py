@@ -14,7 +14,7 @@ placed between samples by linear interpolation; a pixel fires at most once a sam
 light, or that of a neighbour within the block's motion, is a threshold away from their level: the others cannot fire. Where footprints
 are larger than the texture's grain, far above the runway, this may miss an event.
 
-Writes approach.raw (Prophesee EVT3), approach.npz, truth.csv: the state in the middle of every window, from the first event on; and
+Writes approach.raw (Prophesee EVT3), approach.npz, truth.csv: the state at the instant of every window, from the first event on; and
 attitude.csv: what an attitude reference would say, for `run-model --track --attitude`.
 At the defaults the windows are the paper's 1320 images at 25 per second. Exit code 2 if something given cannot be used.
 """
@@ -25,7 +25,7 @@ import csv
 import io
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -57,7 +57,8 @@ TEXTURE_TEXELS = 1024
 TEXTURE_GRAIN_M = 0.012
 """A footprint longer than this holds several independent spots, whose mean has as much less contrast."""
 FLATTEST_FALL = 0.02
-"""A ray that falls by less than this share of its length meets the ground beyond 50 altitudes; it counts as falling by it."""
+"""A ray that falls by less than this share of its length meets the ground beyond 50 altitudes; where no marking goes on so far, it counts
+as falling by it."""
 LARGEST_MOTION_PX = 3
 """Motion within a block, whole pixels, that the choice of pixels to sample covers; more is refused."""
 TRUTH_COLUMNS = ("time_us", *(f"{name}_{unit}" for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True)))
@@ -121,6 +122,10 @@ class Vibration:
         waves = np.sin(2e-6 * np.pi * time_us[:, None, None] * tones + phases_rad) @ [0.7, 0.3]
         swell = self.calmest + (1 - self.calmest) * np.sin(1e-6 * np.pi * time_us / self.swell_s) ** 2
         return swell[:, None] * waves * [self.yaw_rad, self.roll_rad, self.pitch_rad]
+
+    def scaled(self, factor: float) -> Vibration:
+        """The same vibration with all angles so many times as large."""
+        return replace(self, yaw_rad=factor * self.yaw_rad, roll_rad=factor * self.roll_rad, pitch_rad=factor * self.pitch_rad)
 
     def calibration(self, focal_px: float) -> Calibration:
         """The plus-minus of a scene that covers it; pitch moves the image up and down, as an offset of the principal point does."""
@@ -189,11 +194,18 @@ def _turned(axis: int, angle_rad: Floats) -> Floats:
     return np.moveaxis(np.array(rows), -1, 0)
 
 
+def flattest_fall(scene: Scene) -> float:
+    """How far a ray must fall, per unit of its length, to be followed to the ground: half of what leads to the farthest end, or less."""
+    farthest_m = scene.domain.upper[3] + scene.runway.ends_z_m.max()
+    return min(FLATTEST_FALL, float(scene.domain.lower[2] / farthest_m) / 2)
+
+
 class Ground:
     """Log of the light that pixels receive from the target."""
 
     def __init__(self, scene: Scene, target: Target, rng: np.random.Generator) -> None:
         self.scene, self.target = scene, target
+        self._flattest_fall = np.float32(flattest_fall(scene))
         self._texture = _texture(target, rng)
 
     def log_light(self, u: Floats, v: Floats, views: Views) -> Levels:
@@ -201,7 +213,7 @@ class Ground:
         maps = views.to_ground.astype(np.float32)[:, :, :, None]
         columns, rows = u.astype(np.float32), v.astype(np.float32)
         x_w, z_w, fall = (maps[:, row, 0] * columns + maps[:, row, 1] * rows + maps[:, row, 2] for row in range(3))
-        fall = np.maximum(fall, np.float32(FLATTEST_FALL))
+        fall = np.maximum(fall, self._flattest_fall)
         x_m, z_m = x_w / fall, z_w / fall
         # Footprint of a pixel: p_x moves by y / (F w) for a column, p_z by y / (F w^2) for a row.
         across = (views.altitude_m / self.scene.camera.focal_px).astype(np.float32)[:, None] / fall
@@ -352,17 +364,18 @@ def event_camera(
 
 
 def window_truths(flight: Flight, first_event_us: int) -> tuple[NDArray[np.int64], Floats]:
-    """Start (windows,) us and state (windows, 4) at the middle of every window that `FrameStream` makes of the flight."""
+    """Instant (windows,) us, and state (windows, 4) at it, of every window that `FrameStream` makes of the flight."""
     starts = np.arange(first_event_us, flight.duration_us, WINDOW_US)
-    return starts, flight.states(np.asarray(starts + WINDOW_US / 2, dtype=np.float64))
+    instants = starts + round(WINDOW_US * flight.scene.instant_share)
+    return instants, flight.states(instants.astype(np.float64))
 
 
-def truth_text(starts_us: NDArray[np.int64], states: Floats) -> str:
-    """truth.csv: a line a window, with the time of its middle."""
+def truth_text(instants_us: NDArray[np.int64], states: Floats) -> str:
+    """truth.csv: a line a window, with the time of its instant."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(TRUTH_COLUMNS)
-    writer.writerows([start + WINDOW_US // 2, *state] for start, state in zip(starts_us.tolist(), states.tolist(), strict=True))
+    writer.writerows([instant, *state] for instant, state in zip(instants_us.tolist(), states.tolist(), strict=True))
     return text.getvalue()
 
 
@@ -386,20 +399,29 @@ def write_raw(path: Path, events: NDArray[Any], shape: tuple[int, int]) -> None:
             raise OutputError(f"{path}: cannot be written ({error}); free some space there, or give another folder") from error
 
 
-def simulate(scene: Scene, start_s: float, seconds: float, seed: int, out: Path, console: Console) -> None:
+def simulate(
+    scene: Scene,
+    start_s: float,
+    seconds: float,
+    seed: int,
+    out: Path,
+    console: Console,
+    target: Target = Target(),
+    vibration: Vibration = Vibration(),
+) -> None:
     """Flies, writes the four files and prints what was recorded."""
-    camera = event_camera(scene, start_s, seconds, seed)
+    camera = event_camera(scene, start_s, seconds, seed, target, vibration=vibration)
     count = -(-camera.flight.duration_us // BLOCK_US)
     packets = list(track(camera.blocks(), "flying", total=count, console=console, transient=True))
     events = np.concatenate(packets)
-    starts, states = window_truths(camera.flight, int(events["t"][0]))
+    instants, states = window_truths(camera.flight, int(events["t"][0]))
     write_raw(out / "approach.raw", events, scene.camera.shape)
     columns = io.BytesIO()
     np.savez_compressed(columns, t=events["t"], x=events["x"], y=events["y"], p=events["p"])
     write_whole(out / "approach.npz", columns.getvalue())
-    write_whole(out / "truth.csv", truth_text(starts, states).encode())
+    write_whole(out / "truth.csv", truth_text(instants, states).encode())
     write_whole(out / "attitude.csv", attitude_text(attitudes(camera.flight, seed)).encode())
-    console.print(_summary(events, len(starts), camera))
+    console.print(_summary(events, len(instants), camera))
     console.print(f"written: {out}/approach.raw, approach.npz, truth.csv and attitude.csv", markup=False)
 
 
@@ -419,11 +441,15 @@ def main(
     seconds: Annotated[float, typer.Option(min=0.08, help="Length of the recording.")] = PAPER_SECONDS,
     seed: Annotated[int, typer.Option(min=0, help="Seed of flight, ground and sensor.")] = 0,
     out: Annotated[Path, typer.Option(help="Folder for the recording and its truth.")] = Path("out/simulated"),
+    stripe_width: Annotated[float, typer.Option(min=1e-4, help="Width of the stripes, m.")] = Target.stripe_width_m,
+    texture: Annotated[float, typer.Option(min=0, help="Spread of the log of the ground's reflectance.")] = Target.texture_spread,
+    vibration: Annotated[float, typer.Option(min=0, help="How strongly the airframe vibrates; 1 is a propeller's usual.")] = 1.0,
 ) -> None:
     """Simulate an event camera on an approach and write its recording with the truth."""
     console = terminal.console(130)
     try:
-        simulate(Scene.load(scene), start, seconds, seed, out, console)
+        target = Target(stripe_width_m=stripe_width, texture_spread=texture)
+        simulate(Scene.load(scene), start, seconds, seed, out, console, target, Vibration().scaled(vibration))
     except (SceneError, ValueError, OutputError, OSError) as error:
         fail(error)
 

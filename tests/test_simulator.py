@@ -17,10 +17,11 @@ import derive_field
 import simulate_approach as simulator
 from attitude_reference import attitude_text
 from rich.console import Console
+from scenes import AIRPORT
 
 from build_model.calibration import check_calibration
 from build_model.window import Window
-from runtime.camera import project
+from runtime.camera import project, project_points
 from runtime.explanation import missed_pixels
 from runtime.frames import FrameStream
 from runtime.image import dilated, runway_image
@@ -154,8 +155,8 @@ def test_noise_comes_at_its_rate_and_never_from_dead_pixels(paper_scene):
 def test_lines_are_thicker_than_a_pixel_and_some_of_their_pixels_fail_to_fire(paper_scene):
     camera = simulator.event_camera(paper_scene, 22.0, 1.0, 6)
     frames = list(FrameStream(paper_scene.camera.shape, simulator.WINDOW_US).frames(camera.blocks()))
-    starts, states = simulator.window_truths(camera.flight, frames[0][0])
-    assert [start for start, _ in frames] == starts.tolist()
+    instants, states = simulator.window_truths(camera.flight, frames[0][0])
+    assert [start + 20_000 for start, _ in frames] == instants.tolist()
     images = [runway_image(paper_scene, state) != 0 for state in states]
     thickness = [frame[dilated(image, 3)].sum() / image.sum() for (_, frame), image in zip(frames, images, strict=True)]
     assert 2 < np.median(thickness) < 4
@@ -241,6 +242,26 @@ def test_most_windows_of_another_flight_keep_the_fields_budget(paper_scene, repo
     _, states = simulator.window_truths(camera.flight, frames[0][0])
     counted = [missed_pixels(field, frame, state, field.tolerance.line_px) for (_, frame), state in zip(frames, states, strict=True)]
     assert np.mean(np.array(counted) <= field.tolerance.missed_budget) >= 0.8
+
+
+# --- long runways ---
+
+
+def test_a_runway_of_kilometres_is_drawn_to_its_far_end():
+    """Flatter than a fiftieth, too: the middle of a marking has the stripe's light, and what is beside it the ground's."""
+    flight = flight_of(AIRPORT, STEADY)
+    start = np.zeros(1)
+    target = simulator.Target(stripe_width_m=0.9, texture_spread=0.0, patch_share=0.0)
+    ground = simulator.Ground(AIRPORT, target, np.random.default_rng(0))
+    state = flight.states(start)[0]
+    along = np.linspace(10, 2400, 30)
+    for x_m, lit in ((AIRPORT.runway.x_m[0], True), (AIRPORT.runway.x_m[0] - 15, False)):
+        seen = project_points(AIRPORT.camera, state, x_m, along)
+        light = np.exp(ground.log_light(seen[:, 0], seen[:, 1], flight.views(start)))[0]
+        covered = (light - target.ground_reflectance) / (1 - target.ground_reflectance)
+        across_m = state[2] / AIRPORT.camera.focal_px / (state[2] / (along + state[3]))
+        assert (covered > 0.5 * np.minimum(0.9 / across_m, 1)).all() if lit else (covered < 0.01).all()
+    assert state[2] / (along[-1] + state[3]) < simulator.FLATTEST_FALL
 
 
 # --- the attitude reference ---
