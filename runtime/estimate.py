@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -59,6 +60,13 @@ class Box:
 
     def __reduce__(self) -> tuple[type[Box], tuple[NDArray[np.float64], NDArray[np.float64]]]:
         return Box, (self.lower, self.upper)  # a copy from another process is checked and read-only too
+
+    @staticmethod
+    def around(boxes: Sequence[Box]) -> Box | None:
+        """The smallest box that holds all of these; None of none."""
+        if not boxes:
+            return None
+        return Box(np.min([box.lower for box in boxes], axis=0), np.max([box.upper for box in boxes], axis=0))
 
     @property
     def centre(self) -> NDArray[np.float64]:

@@ -191,7 +191,7 @@ class Estimator:
         proposal: NDArray[np.float64] | None = None,
     ) -> Estimate:
         """The estimate whose box is the hull of `regions`; its outcome is `otherwise` where there are none."""
-        box = Box(np.min([part.lower for part in regions], axis=0), np.max([part.upper for part in regions], axis=0)) if regions else None
+        box = Box.around(regions)
         state, used_fallback = self._shielded(box, found.network_state if proposal is None else proposal)
         return Estimate(
             outcome=otherwise if box is None else Outcome.CERTIFIED,

@@ -65,13 +65,13 @@ class Tracker:
         """Forgets all frames; the next one is read by itself."""
         self._earlier: tuple[Seen, ...] = ()
         self._latest: tuple[Box, Displacement] | None = None
-        self._time_us: int | None = None
-        self._first_us: int | None = None
+        self._time_us: float | None = None
+        self._first_us: float | None = None
 
     def update(
         self,
         frame: NDArray,
-        time_us: int,
+        time_us: float,
         prior: Box | None = None,
         displacement: Mapping[str, tuple[float, float]] | None = None,
     ) -> Estimate:
@@ -94,7 +94,7 @@ class Tracker:
         left, seen = self._left(found, prior)
         return self._followed(found, left, seen, prior) if len(left) else self._contradicted(found, prior)
 
-    def box_at(self, time_us: int) -> Box | None:
+    def box_at(self, time_us: float) -> Box | None:
         """The box that the state lies in at another instant, by the last certified box and the motion; None where nothing is known."""
         if self._latest is None or self._time_us is None:
             return None
@@ -102,7 +102,7 @@ class Tracker:
         lower, upper = moved_box(box.lower, box.upper, since + self.motion.over(time_us - self._time_us))
         return Box(lower, upper) if np.isfinite(lower).all() and np.isfinite(upper).all() else None
 
-    def _step(self, time_us: int, displacement: Mapping[str, tuple[float, float]] | None) -> Displacement | None:
+    def _step(self, time_us: float, displacement: Mapping[str, tuple[float, float]] | None) -> Displacement | None:
         """How far the state can have moved since the last frame; None if this one is older."""
         elapsed_us = 0 if self._time_us is None else time_us - self._time_us
         step = self.motion.over(max(elapsed_us, 0)).replaced(displacement or {})
@@ -171,8 +171,7 @@ class Tracker:
             return self.estimator.concluded(found, (), assumed)
         self._earlier, self._first_us = (self._passed_on(alone),), time_us
         if self.outliers == 0:
-            whole = regions_of(alone, self._domain, [np.arange(len(alone))])[0]
-            self._latest = whole, STANDSTILL
+            self._latest = regions_of(alone, self._domain, [np.arange(len(alone))])[0], STANDSTILL
         return self.estimator.concluded(found, (), assumed, Outcome.INCONSISTENT)
 
     def _passed_on(self, sets: StateSet) -> Seen:
@@ -187,6 +186,6 @@ class Tracker:
         frames = "every frame that was followed" if self.horizon is None else f"each of the last {self.horizon} frames"
         if self.outliers:
             frames = f"of the last {self.horizon} frames all but {self.outliers} at most"
-        since = "" if self._first_us is None else f" since {self._first_us} us"
+        since = "" if self._first_us is None else f" since {self._first_us:.16g} us"
         own = (f"Over time: this holds of {frames}{since}, and the state moves by {self.motion}, or as told.",)
         return (*self.estimator.assumed, *(() if prior is None else (prior_assumption(prior.lower, prior.upper),)), *own)

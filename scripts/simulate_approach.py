@@ -399,23 +399,13 @@ def write_raw(path: Path, events: NDArray[Any], shape: tuple[int, int]) -> None:
             raise OutputError(f"{path}: cannot be written ({error}); free some space there, or give another folder") from error
 
 
-def simulate(
-    scene: Scene,
-    start_s: float,
-    seconds: float,
-    seed: int,
-    out: Path,
-    console: Console,
-    target: Target = Target(),
-    vibration: Vibration = Vibration(),
-) -> None:
-    """Flies, writes the four files and prints what was recorded."""
-    camera = event_camera(scene, start_s, seconds, seed, target, vibration=vibration)
+def simulate(camera: EventCamera, seed: int, out: Path, console: Console) -> None:
+    """Flies, writes the four files and prints what was recorded; `seed` is that of the attitude reference's errors."""
     count = -(-camera.flight.duration_us // BLOCK_US)
     packets = list(track(camera.blocks(), "flying", total=count, console=console, transient=True))
     events = np.concatenate(packets)
     instants, states = window_truths(camera.flight, int(events["t"][0]))
-    write_raw(out / "approach.raw", events, scene.camera.shape)
+    write_raw(out / "approach.raw", events, camera.flight.scene.camera.shape)
     columns = io.BytesIO()
     np.savez_compressed(columns, t=events["t"], x=events["x"], y=events["y"], p=events["p"])
     write_whole(out / "approach.npz", columns.getvalue())
@@ -449,7 +439,8 @@ def main(
     console = terminal.console(130)
     try:
         target = Target(stripe_width_m=stripe_width, texture_spread=texture)
-        simulate(Scene.load(scene), start, seconds, seed, out, console, target, Vibration().scaled(vibration))
+        camera = event_camera(Scene.load(scene), start, seconds, seed, target, vibration=Vibration().scaled(vibration))
+        simulate(camera, seed, out, console)
     except (SceneError, ValueError, OutputError, OSError) as error:
         fail(error)
 

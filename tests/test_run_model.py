@@ -610,6 +610,13 @@ def test_attitudes_that_cannot_be_used_are_refused(recording, tmp_path, text, fo
     assert found in done.stderr
 
 
+def test_windows_of_an_odd_length_are_certified_at_their_very_middle(recording, truth, tmp_path):
+    done = invoke(MODEL, recording, "-o", tmp_path, "--truth", truth, "--no-video", "--window-ms", 40.001, "--track", "--motion", MOTION)
+    assert done.exit_code == 0
+    rows = rows_of(tmp_path)
+    assert [float(row["instant_us"]) - int(row["time_us"]) for row in rows] == [20_000.5] * len(rows)
+
+
 def test_readings_are_moved_to_the_instant_between_them(tmp_path):
     readings = AttitudeReadings.load(attitude_file(tmp_path / "a.csv", 0.0))
     estimator = Estimator.load(MODEL)

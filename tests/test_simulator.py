@@ -167,7 +167,7 @@ def test_lines_are_thicker_than_a_pixel_and_some_of_their_pixels_fail_to_fire(pa
 
 
 def test_the_files_hold_the_same_events_and_the_truth_of_every_window(paper_scene, tmp_path):
-    simulator.simulate(paper_scene, 3.0, 0.2, 5, tmp_path, Console(quiet=True))
+    simulator.simulate(simulator.event_camera(paper_scene, 3.0, 0.2, 5), 5, tmp_path, Console(quiet=True))
     events = np.concatenate(list(simulator.event_camera(paper_scene, 3.0, 0.2, 5).blocks()))
     for name in ("approach.raw", "approach.npz"):
         read = np.concatenate(list(read_events(tmp_path / name, (480, 640))))

@@ -186,6 +186,18 @@ def test_the_box_between_frames_grows_both_ways(paper: Estimator) -> None:
     assert tracker.box_at(0) is None
 
 
+def test_instants_between_microseconds_are_not_rounded(paper: Estimator) -> None:
+    """Windows of an odd length have them; rounded to even numbers, a microsecond of motion could become none, or two."""
+    fast = Motion([-1e4, 0, 0, 0], [1e4, 0, 0, 0])
+    tracker = Tracker(paper, fast)
+    first = tracker.update(image(MIDDLE), 1.5)
+    box = tracker.box_at(2.5)
+    assert first.box is not None
+    assert box is not None
+    np.testing.assert_allclose(box.half_widths[0] - first.box.half_widths[0], 0.01, atol=1e-9)
+    assert "since 1.5 us" in first.assumed[-1]
+
+
 def test_unknown_rates_predict_nothing(paper: Estimator) -> None:
     tracker = Tracker(paper, Motion(np.full(4, -np.inf), np.full(4, np.inf)))
     assert tracker.update(image(MIDDLE), 0).certified

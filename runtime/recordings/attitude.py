@@ -5,17 +5,15 @@ Aviation's signs: pitch is positive with the nose up, so that a camera along the
 
 from __future__ import annotations
 
-import csv
-import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.errors import one_line
 from runtime.estimate import Box
 from runtime.motion import Motion
+from runtime.recordings.timed_rows import timed_rows
 from runtime.rounding import lowered, raised
 
 ANGLES = ("roll", "pitch", "yaw")
@@ -37,15 +35,11 @@ class AttitudeReadings:
     @classmethod
     def load(cls, path: str | Path) -> AttitudeReadings:
         """Reads a CSV file with the columns of `COLUMNS`. Raises `AttitudeError`."""
-        advice = f"give a CSV file with the columns {', '.join(COLUMNS)}"
         try:
-            with Path(path).open(encoding="utf-8", newline="") as file:
-                names = next(csv.reader(file), [])
-            with warnings.catch_warnings(action="ignore"):  # of a file without a line, which is refused below
-                rows = np.loadtxt(path, delimiter=",", skiprows=1, usecols=[names.index(name) for name in COLUMNS], ndmin=2)
-        except (OSError, ValueError) as error:
-            raise AttitudeError(f"{path}: {one_line(error)}; {advice}") from error
-        if len(rows) == 0 or not np.isfinite(rows).all() or (np.diff(rows[:, 0]) <= 0).any() or (rows[:, 4:] < 0).any():
+            rows = timed_rows(path, COLUMNS)
+        except ValueError as error:
+            raise AttitudeError(error) from error
+        if (rows[:, 4:] < 0).any():
             found = f"{len(rows)} lines, times that do not ascend, numbers that are not finite, or a plus-minus below 0"
             raise AttitudeError(f"{path}: found {found}; give finite numbers in order of time")
         return cls(rows[:, 0], rows[:, 1:4], rows[:, 4:])

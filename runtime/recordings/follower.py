@@ -49,7 +49,7 @@ class Follower:
         self.latest_us = instant_us
         domain = self.tracker.estimator.domain
         prior = None if self.attitude is None else self.attitude.prior(instant_us, self.tracker.motion, domain)
-        return self.tracker.update(frame, round(instant_us), prior)
+        return self.tracker.update(frame, instant_us, prior)
 
 
 def _motion(text: str) -> Motion:

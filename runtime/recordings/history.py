@@ -52,8 +52,7 @@ class Moment:
         bounds = [(moment.lower, moment.upper) for moment in (self, later) if moment.lower is not None and moment.upper is not None]
         lower = np.min([low for low, _ in bounds], axis=0) if bounds else None
         upper = np.max([high for _, high in bounds], axis=0) if bounds else None
-        boxes = [moment.tracked for moment in (self, later) if moment.tracked is not None]
-        tracked = Box(np.min([box.lower for box in boxes], axis=0), np.max([box.upper for box in boxes], axis=0)) if boxes else None
+        tracked = Box.around([moment.tracked for moment in (self, later) if moment.tracked is not None])
         state, truth = (old if new is None else new for old, new in ((self.state, later.state), (self.truth, later.truth)))
         return Moment(self.start_us, later.stop_us, state, lower, upper, truth, tracked)
 

@@ -128,7 +128,7 @@ class Report:
         if tracked is None:
             return [""] * len(self._tracked_columns)
         inside = "" if truth is None else int(tracked.box is not None and tracked.box.contains(truth))
-        return [f"{instant_us:g}" if instant_us % 1 else int(instant_us), tracked.outcome.value, *_numbers(tracked), inside][
+        return [instant_us if instant_us % 1 else int(instant_us), tracked.outcome.value, *_numbers(tracked), inside][
             : len(self._tracked_columns)
         ]
 

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.errors import one_line
 from runtime.estimate import Estimate
 from runtime.explanation import Shortfall, shortfall
+from runtime.recordings.timed_rows import timed_rows
 from runtime.scene import STATE_COLUMNS, Scene
 
 
@@ -30,15 +29,9 @@ class Truth:
     def load(cls, path: str | Path) -> Truth:
         """Reads a CSV file with the columns time_us, theta_rad, x_m, y_m, z_m. Raises `TruthError`."""
         try:
-            with Path(path).open(encoding="utf-8", newline="") as file:
-                names = next(csv.reader(file), [])
-            wanted = [names.index(name) for name in ("time_us", *STATE_COLUMNS)]
-            rows = np.loadtxt(path, delimiter=",", skiprows=1, usecols=wanted, ndmin=2)
-        except (OSError, ValueError) as error:
-            reason = one_line(error)
-            raise TruthError(f"{path}: {reason}; give a CSV file with the columns time_us, {', '.join(STATE_COLUMNS)}") from error
-        if len(rows) == 0 or not np.isfinite(rows).all() or (np.diff(rows[:, 0]) <= 0).any():
-            raise TruthError(f"{path}: found {len(rows)} lines, or times that do not ascend; give finite numbers in order of time")
+            rows = timed_rows(path, ("time_us", *STATE_COLUMNS))
+        except ValueError as error:
+            raise TruthError(error) from error
         return cls(rows[:, 0], rows[:, 1:])
 
     def at(self, time_us: float) -> NDArray[np.float64] | None:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from runtime.estimate import Box
 from runtime.model.limits import BELOW_HORIZON_PX
 from runtime.refine.altitude import contract_by_altitude
+from runtime.refine.interval import intersected
 from runtime.rounding import lowered, raised
 from runtime.scene import Camera
 from runtime.state_set import StateSet, scale_ratio, tangent_of_row
@@ -110,7 +111,7 @@ def all_but(sources: Sequence[StateSet], start: StateSet, outliers: int) -> list
 
 def _common(first: Floats, second: Floats) -> Floats:
     """What two intervals (sets, 2) have in common; inverted if nothing."""
-    return np.stack([np.maximum(first[:, 0], second[:, 0]), np.minimum(first[:, 1], second[:, 1])], axis=-1)
+    return np.stack(intersected((first[:, 0], first[:, 1]), (second[:, 0], second[:, 1])), axis=-1)
 
 
 def _hulls(parts: StateSet, place: NDArray[np.int64], count: int, tangent: Floats) -> StateSet:
