@@ -19,11 +19,11 @@ Columns = tuple[NDArray[np.int64], NDArray[np.int64]]
 def _scale_at_distance(camera: Camera, theta: Floats, d: Floats, start: Floats, stop: Floats) -> tuple[Floats, Floats]:
     """Range of g over rows with tangents [start, stop], (sets, rows) each, of ground d (sets, 2) ahead that is seen there.
 
-    F (cos(theta) - t sin(theta)) / d is affine in t, and falls in theta as long as psi >= 0; it is at most F sqrt(1 + t^2) / d.
+    F_u (cos(theta) - t sin(theta)) / d is affine in t, and falls in theta as long as psi >= 0; it is at most F_u sqrt(1 + t^2) / d.
     """
     low = np.minimum(*(np.maximum(reach(theta[:, 1:], tangent), 0) for tangent in (start, stop)))
     high = np.maximum(*(_farthest_reach(theta[:, :1], tangent) for tangent in (start, stop)))
-    return camera.focal_px * low / d[:, 1:], camera.focal_px * high / d[:, :1]
+    return camera.focal_u_px * low / d[:, 1:], camera.focal_u_px * high / d[:, :1]
 
 
 def _farthest_reach(theta: Floats, tangent: Floats) -> Floats:
