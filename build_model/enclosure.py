@@ -62,6 +62,17 @@ def columns_that_may_be_lit(scene: Scene, sets: StateSet, beyond_px: int = 0) ->
     return np.stack(firsts, axis=1), np.stack(lasts, axis=1)
 
 
+def rows_that_must_be_crossed(scene: Scene, sets: StateSet) -> NDArray[np.bool_]:
+    """True for the rows of the frame whose inside each marking meets in all states of a set, (sets, markings, rows)."""
+    camera, top = scene.camera, np.arange(scene.camera.height, dtype=np.float64)
+    crossed = []
+    for near, far in scene.runway.ends_z_m:
+        start = np.maximum(top, above(end_rows(camera, sets, far)[1])[:, None])
+        stop = np.minimum(top + 1, below(end_rows(camera, sets, near)[0])[:, None])
+        crossed.append(start < stop)
+    return np.stack(crossed, axis=1)
+
+
 def columns_that_must_be_lit(scene: Scene, sets: StateSet) -> Columns:
     """Inner enclosure of I_r: every state of the set lights each pixel within the returned columns of a row.
 

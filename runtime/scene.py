@@ -353,6 +353,23 @@ class Bank:
 
 
 @dataclass(frozen=True)
+class WindowedBank:
+    """A bank for a whole approach: entries that move the image by tens of px, tested by must-hit windows (`build_model.window_bank`)."""
+
+    set_px: float = 20.0
+    """How far, in px, the states of an entry move the image at most along each of its axes, about; less where the runway has few rows."""
+    rows: int = 16
+    """Rows of pixels in which an entry has windows, at most."""
+    places: int = 128
+    """Groups of entries that a frame opens, at most; what passes beyond these stays whole."""
+
+    def __post_init__(self) -> None:
+        _demand(0.5 <= self.set_px <= 1000, "bank.set_px", self.set_px, "give 0.5 to 1000 px")
+        for name, most in (("rows", 1000), ("places", 10_000)):
+            _demand(1 <= getattr(self, name) <= most, f"bank.{name}", getattr(self, name), f"give a count of 1 to {most}")
+
+
+@dataclass(frozen=True)
 class Tolerance:
     """What a frame may lack or add: see the assumptions of Theorems A and B in `docs/guarantee.md`."""
 
@@ -423,7 +440,7 @@ class Scene:
     camera: Camera
     runway: Runway
     domain: Domain
-    bank: Bank
+    bank: Bank | WindowedBank
     calibration: Calibration = Calibration()
     tolerance: Tolerance = Tolerance()
     estimator: EstimatorTraining = EstimatorTraining()
@@ -515,7 +532,7 @@ def _read(kind: Any, value: Any, key: str) -> Any:
         return _read_table(kind, value, key)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is types.UnionType:
-        return _read(next(part for part in arguments if part is not type(None)), value, key)
+        return _read(_kind_of([part for part in arguments if part is not type(None)], value), value, key)
     if origin is tuple:
         return _read_tuple(arguments, value, key)
     if kind is float:
@@ -525,6 +542,12 @@ def _read(kind: Any, value: Any, key: str) -> Any:
     usable = isinstance(value, kind) and not (kind is int and isinstance(value, bool))
     _demand(usable, key, repr(value), f"give {'a whole number' if kind is int else 'a text'}")
     return value
+
+
+def _kind_of(kinds: list[Any], value: Any) -> Any:
+    """The first of several tables that knows all keys which are given, or the first of all."""
+    known = (kind for kind in kinds if len(kinds) > 1 and isinstance(value, dict) and set(value) <= set(typing.get_type_hints(kind)))
+    return next(known, kinds[0])
 
 
 def _read_table(kind: Any, table: Any, key: str) -> Any:

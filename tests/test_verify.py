@@ -28,7 +28,8 @@ from build_model.assembly import assemble
 from build_model.export import build_banks, export_model
 from build_model.filter_graph import filter_graph
 from build_model.filter_tables import FilterTables
-from build_model.hough_bank import CellBank, LineBoxes
+from build_model.hough_bank import CellBank
+from build_model.line_boxes import LineBoxes
 from build_model.pixel_mask import runs_of
 from build_model.verify import cli
 from build_model.verify.ball_camera import PRECISION_BITS, BallCamera, BallEntry, Ends, Slice, columns, columns_crossed
