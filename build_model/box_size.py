@@ -17,6 +17,6 @@ def clean_half_widths(estimator: Estimator, count: int = CLEAN_FRAMES, seed: int
     Such a frame has no dark pixel of the runway and no clutter, so Theorems A and B both promise a box.
     """
     scene = estimator.scene
-    states = np.random.default_rng(seed).uniform(scene.domain.lower, scene.domain.upper, (count, 4))
+    states = scene.domain.uniform(np.random.default_rng(seed), count)
     boxes = (estimator.estimate(runway_image(scene, state)).box for state in states)
     return np.array([box.half_widths for box in boxes if box is not None])

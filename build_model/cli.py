@@ -161,7 +161,7 @@ def bound_rows(scene: Scene, bounds: Sequence[PaperBound | None], half_widths: N
         lacking = f"; none for {len(bounds) - len(finite)} of {len(bounds)} cells" if len(finite) < len(bounds) else ""
         paper = f"{_span([bound.state_error for bound in finite])} (L_h {constants} per px, delta {extents} px){lacking}"
     diagonal = np.median(2 * np.linalg.norm(half_widths, axis=1))
-    free = np.flatnonzero(scene.domain.upper > scene.domain.lower)
+    free = np.flatnonzero(~scene.domain.fixed)
     medians = np.median(half_widths, axis=0)
     return {
         "the paper's bound, not a certificate": paper,

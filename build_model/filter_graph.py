@@ -199,7 +199,7 @@ def _hull(g: GraphWriter, scene: Scene, tables: FilterTables, side: str, cells: 
     states, sides = getattr(tables, f"state_{side}"), []
     for axis, name in enumerate(STATE_NAMES):
         own = g.constant(f"{name}_{side}", states[..., axis])
-        if scene.domain.lower[axis] == scene.domain.upper[axis]:
+        if scene.domain.fixed[axis]:
             sides.append(g.constant(f"whole_{name}_{side}", cells[:, axis]))
         else:
             candidates = g.node(remove, f"{name}_{side}_candidates", own, "removed_by")

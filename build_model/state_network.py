@@ -237,7 +237,7 @@ class FrameSource:
         return FilteredFrames(states, bits, self.window)
 
     def _batch(self, count: int, rng: np.random.Generator, clutter: float | None) -> tuple[NDArray[np.float64], Frames]:
-        states = rng.uniform(self.scene.domain.lower, self.scene.domain.upper, (count, 4))
+        states = self.scene.domain.uniform(rng, count)
         ends = project(self.scene, states) - [self.window.left, self.window.top]
         crops = image_of_ends(ends, self.window.shape)
         density = np.full(count, clutter)

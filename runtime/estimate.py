@@ -119,7 +119,7 @@ class Estimate:
     regions: tuple[Box, ...]
     """Connected parts of what is consistent, each in its box; more than one is an ambiguity. One without refinement."""
     touches_boundary: bool
-    """The box reaches a face of the domain: it holds the state only if the aircraft is in the domain."""
+    """The box reaches a face of the domain, the union of its cells: it holds the state only if the aircraft is in the domain."""
     assumed: tuple[str, ...]
     """What the certificate rests on, in words: the model's assumptions, and what else was taken to be known."""
 

@@ -70,8 +70,7 @@ class Estimator:
             raise ModelError(f"{name}: its metadata misstate the smallest |K| of its entries; export it again with export-model")
         self._session = open_session(model.content, name, threads)
         check_interface(self._session, self.scene, model.tensors["must_light_size"].shape, name)
-        self.domain = Box(self.scene.domain.lower, self.scene.domain.upper)
-        self._fixed = self.domain.lower == self.domain.upper
+        self.domain = Box(self.scene.domain.lower, self.scene.domain.upper)  # the hull of the cells
         window = self._entries.window_and_beyond(REFINED_BEYOND_PX)
         self._refiner = Refiner(self.scene, int(self._budgets["missed_budget"]), int(self._budgets["extra_budget"]), window)
         budgets = {name: int(budget) for name, budget in self._budgets.items()}
@@ -159,11 +158,11 @@ class Estimator:
         """What the model says of a frame. Raises `FrameError` as `estimate` does."""
         pixels = self._checked_frame(frame)
         cell, support, mismatch, passes, lower, upper, filtered, network_state = self.run_unchecked(pixels).values()
-        network = np.where(self._fixed, self.domain.lower, network_state)
+        network = np.where(self.scene.domain.fixed, self.domain.lower, network_state)
         return Found(pixels, int(cell), support, mismatch, passes, lower, upper, filtered, network)
 
     def covering(self, prior: Box) -> StateSet:
-        """The part of a box that lies in the domain, as a set of states; no set where there is none."""
+        """The part of a box that lies in the domain's hull, as a set of states; no set where there is none."""
         low, high = np.maximum(prior.lower, self.domain.lower), np.minimum(prior.upper, self.domain.upper)
         if (low > high).any():
             return self._entries.all[:0]
@@ -204,7 +203,7 @@ class Estimator:
             mismatch=int(found.mismatch[found.cell]),
             filtered=found.filtered,
             regions=regions,
-            touches_boundary=box is not None and self._touches_boundary(box),
+            touches_boundary=box is not None and self.scene.domain.reaches_boundary(box.lower, box.upper),
             assumed=assumed,
         )
 
@@ -250,10 +249,6 @@ class Estimator:
         if box is None:
             return None, False
         return (proposal, False) if box.contains(proposal) else (box.centre, True)
-
-    def _touches_boundary(self, box: Box) -> bool:
-        touches = (box.lower <= self.domain.lower) | (box.upper >= self.domain.upper)
-        return bool((touches & ~self._fixed).any())
 
     def _checked_frame(self, frame: NDArray) -> NDArray[np.uint8]:
         expected = f"an array {self.scene.camera.shape} of bool, or of uint8 0 and 1"

@@ -140,7 +140,7 @@ def _states(scene: Scene, lines: Floats, tangents: Floats) -> Floats:
     """States (n, 4) of the domain, near those with the line coordinates theta, x, scale, z (n, 4); `runtime.state_set`."""
     theta, x, scale, z = lines.T
     y = scene.camera.focal_u_px * fall(theta, tangents) / scale
-    return np.clip(np.stack([theta, x, y, z], axis=-1), scene.domain.lower, scene.domain.upper)
+    return scene.domain.nearest(np.stack([theta, x, y, z], axis=-1))
 
 
 def _dark_sums(scene: Scene, frame: NDArray) -> NDArray[np.int32]:

@@ -7,7 +7,6 @@ A scene file is TOML; `Scene.load` reads it into frozen dataclasses that check t
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 import tomllib
 import types
@@ -20,17 +19,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.domain import LARGEST_COORDINATE, MOST_ITEMS, SMALLEST_EXTENT, Domain, read_only
+from runtime.domain import Axis as Axis
+from runtime.scene_error import SceneError
+from runtime.scene_error import demand as _demand
+
 STATE_NAMES = ("theta", "x", "y", "z")
 STATE_UNITS = ("rad", "m", "m", "m")
 STATE_COLUMNS = tuple(f"{name}_{unit}" for name, unit in zip(STATE_NAMES, STATE_UNITS, strict=True))
 """Names of a state's numbers in tables."""
-TILING_TOLERANCE = 1e-9
-"""Largest gap or overlap between neighbouring cells, in the axis's unit, that is read as decimal rounding in the file."""
-SMALLEST_EXTENT = 1e-6
-"""Smallest width of a cell, length of a marking, altitude and distance ahead: far above `TILING_TOLERANCE`, and never lost when
-added to a coordinate."""
-LARGEST_COORDINATE = 1e6
-"""Largest size of a coordinate: with it no sum or quotient of a scene's numbers overflows, nor loses `SMALLEST_EXTENT`."""
 SMALLEST_ANGLE_AHEAD_RAD = 1e-6
 """A point closer than this to the plane Z = 0 through the camera's centre counts as behind it: far above float64's error."""
 FOCAL_RANGE_PX = (1.0, 1e6)
@@ -50,27 +47,6 @@ LARGEST_COEFFICIENT = 1e3
 """Largest coefficient of a lens: far beyond any that is real, so that none overflows."""
 INSTANTS = {"start": 0.0, "middle": 0.5, "end": 1.0}
 """Instants of a window of events, and the share of it that lies before them."""
-MOST_ITEMS = 2**12
-"""Markings, and cells along an axis, that are read: a tenth of a second's work."""
-LONGEST_FOUND = 200
-"""Characters of a faulty value that an error quotes."""
-
-
-class SceneError(ValueError):
-    """A scene file, or a value in it, that cannot be used. One line: the key, what was found, what to do."""
-
-
-def _demand(holds: bool, key: str, found: object, advice: str) -> None:
-    if not holds:
-        text = str(found)
-        quoted = text if len(text) <= LONGEST_FOUND else f"{text[:LONGEST_FOUND]}..."
-        raise SceneError(f"{key}: found {quoted}; {advice}")
-
-
-def _read_only(array: NDArray[Any]) -> NDArray[Any]:
-    """The array itself, from now on read-only."""
-    array.flags.writeable = False
-    return array
 
 
 @dataclass(frozen=True)
@@ -248,87 +224,22 @@ class Runway:
     @cached_property
     def x_m(self) -> NDArray[np.float64]:
         """p_x of every marking, (markings,)."""
-        return _read_only(np.array([marking.x_m for marking in self.markings]))
+        return read_only(np.array([marking.x_m for marking in self.markings]))
 
     @cached_property
     def ends_z_m(self) -> NDArray[np.float64]:
         """p_z of the near and the far end of every marking, (markings, 2)."""
-        return _read_only(np.array([marking.ends_z_m for marking in self.markings]))
+        return read_only(np.array([marking.ends_z_m for marking in self.markings]))
 
     @cached_property
     def distances_z_m(self) -> NDArray[np.float64]:
         """p_z of all ends, each once, ascending: what equal ends share is computed once."""
-        return _read_only(np.unique(self.ends_z_m))
+        return read_only(np.unique(self.ends_z_m))
 
     @cached_property
     def place_of_ends(self) -> NDArray[np.int64]:
         """Where the near and the far end of every marking are among `distances_z_m`, (markings, 2)."""
-        return _read_only(np.searchsorted(self.distances_z_m, self.ends_z_m))
-
-
-@dataclass(frozen=True)
-class Axis:
-    """One axis of the domain, tiled by cells of one width around the given centres; width 0 fixes the axis at its one centre."""
-
-    centres: tuple[float, ...]
-    width: float
-
-    def check(self, key: str) -> None:
-        """Raises `SceneError` unless the cells tile an interval without gap or overlap."""
-        _demand(len(self.centres) > 0, f"{key}.centres", "none", "give at least one centre")
-        for value in self.centres:
-            _demand(abs(value) <= LARGEST_COORDINATE, f"{key}.centres", value, f"stay within {LARGEST_COORDINATE:.0f}")
-        usable = self.width == 0 or SMALLEST_EXTENT <= self.width <= LARGEST_COORDINATE
-        _demand(usable, f"{key}.width", self.width, f"give 0 (fixed axis), or {SMALLEST_EXTENT} to {LARGEST_COORDINATE:.0f}")
-        if self.width == 0:
-            _demand(len(self.centres) == 1, f"{key}.centres", list(self.centres), "an axis of width 0 has one centre")
-        for left, right in itertools.pairwise(self.centres):
-            gap = right - left - self.width
-            _demand(abs(gap) <= TILING_TOLERANCE, f"{key}.centres", f"{left} and {right}", f"neighbours must ascend by {self.width}")
-
-    @property
-    def edges(self) -> NDArray[np.float64]:
-        """Borders of the cells, (cells + 1,), ascending; neighbours share theirs to the last bit. Two equal ones if fixed."""
-        centres, half = np.array(self.centres), self.width / 2
-        return np.concatenate([centres[:1] - half, (centres[:-1] + centres[1:]) / 2, centres[-1:] + half])
-
-
-@dataclass(frozen=True)
-class Domain:
-    """The states that a certificate speaks of: a box in (theta, x, y, z), tiled by cells."""
-
-    theta_rad: Axis
-    x_m: Axis
-    y_m: Axis
-    z_m: Axis
-
-    def __post_init__(self) -> None:
-        for field, axis in zip(dataclasses.fields(self), self.axes, strict=True):
-            axis.check(f"domain.{field.name}")
-        low, high = self.lower, self.upper
-        pitches = [float(low[0]), float(high[0])]
-        _demand(low[0] > -math.pi / 2 and high[0] < math.pi / 2, "domain.theta_rad", pitches, "stay within -pi/2 and pi/2")
-        _demand(low[2] >= SMALLEST_EXTENT, "domain.y_m", low[2], "the camera must be above the runway: y > 0 throughout")
-
-    @property
-    def axes(self) -> tuple[Axis, Axis, Axis, Axis]:
-        """The four axes in state order."""
-        return self.theta_rad, self.x_m, self.y_m, self.z_m
-
-    @property
-    def lower(self) -> NDArray[np.float64]:
-        """Smallest state of the domain, (4,)."""
-        return np.array([axis.edges[0] for axis in self.axes])
-
-    @property
-    def upper(self) -> NDArray[np.float64]:
-        """Largest state of the domain, (4,)."""
-        return np.array([axis.edges[-1] for axis in self.axes])
-
-    @property
-    def cell_count(self) -> int:
-        """Number of cells."""
-        return math.prod(len(axis.centres) for axis in self.axes)
+        return read_only(np.searchsorted(self.distances_z_m, self.ends_z_m))
 
 
 @dataclass(frozen=True)
@@ -448,7 +359,7 @@ class Scene:
     window: EventWindow | None = None
 
     def __post_init__(self) -> None:
-        low, high = self.domain.lower, self.domain.upper
+        low, high = self.domain.lower, self.domain.upper  # the hull's: the runtime's sets are cut to it
         nearest, farthest = low[3] + self.runway.ends_z_m.min(), high[3] + self.runway.ends_z_m.max()
         _demand(nearest >= SMALLEST_EXTENT, "domain.z_m", low[3], "a marking starts beside or behind the camera: keep z + start_z_m > 0")
         steepest, flattest = math.atan2(high[2], nearest) - low[0], math.atan2(low[2], farthest) - high[0]
@@ -520,8 +431,13 @@ class Scene:
 def _plain(value: Any) -> Any:
     """`value` with tuples as lists and without the absent entries, which TOML cannot write."""
     if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items() if item is not None}
+        return {_key_of(name): _plain(item) for name, item in value.items() if item is not None}
     return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
+
+
+def _key_of(name: str) -> str:
+    """A field's key in a scene file: its name, without the underscore that keeps it apart from a word of Python."""
+    return name.removesuffix("_")
 
 
 def _read(kind: Any, value: Any, key: str) -> Any:
@@ -532,7 +448,7 @@ def _read(kind: Any, value: Any, key: str) -> Any:
         return _read_table(kind, value, key)
     origin, arguments = typing.get_origin(kind), typing.get_args(kind)
     if origin is types.UnionType:
-        return _read(_kind_of([part for part in arguments if part is not type(None)], value), value, key)
+        return _read(_kind_meant([part for part in arguments if part is not type(None)], value, key), value, key)
     if origin is tuple:
         return _read_tuple(arguments, value, key)
     if kind is float:
@@ -544,23 +460,32 @@ def _read(kind: Any, value: Any, key: str) -> Any:
     return value
 
 
-def _kind_of(kinds: list[Any], value: Any) -> Any:
-    """The first of several tables that knows all keys which are given, or the first of all."""
-    known = (kind for kind in kinds if len(kinds) > 1 and isinstance(value, dict) and set(value) <= set(typing.get_type_hints(kind)))
-    return next(known, kinds[0])
+def _kind_meant(kinds: list[Any], table: Any, key: str) -> Any:
+    """Of several kinds of tables the one that has the most of the table's keys. Raises `SceneError` if none has any."""
+    if len(kinds) == 1:
+        return kinds[0]
+    keys = {kind: [_key_of(field.name) for field in dataclasses.fields(kind)] for kind in kinds}
+    *others, last = (f"{{ {', '.join(names)} }}" for names in keys.values())
+    known = isinstance(table, dict) and any(name in table for names in keys.values() for name in names)
+    _demand(known, key, repr(table), f"give {', '.join(others)} or {last}")
+    return max(kinds, key=lambda kind: sum(name in table for name in keys[kind]))
 
 
 def _read_table(kind: Any, table: Any, key: str) -> Any:
     _demand(isinstance(table, dict), key or "scene", repr(table), "give a table")
-    hints, fields = typing.get_type_hints(kind), dataclasses.fields(kind)
+    hints, fields = typing.get_type_hints(kind), {_key_of(field.name): field for field in dataclasses.fields(kind)}
     prefix = f"{key}." if key else ""
     for name in table:
         shown = name if isinstance(name, str) and name.isprintable() else repr(name)
-        _demand(name in hints, f"{prefix}{shown}", "an unknown key", f"known here: {', '.join(hints)}")
-    for field in fields:
-        optional = field.default is not dataclasses.MISSING
-        _demand(optional or field.name in table, f"{prefix}{field.name}", "nothing", "this key is required")
-    return kind(**{name: _read(hints[name], value, f"{prefix}{name}") for name, value in table.items()})
+        _demand(name in fields, f"{prefix}{shown}", "an unknown key", f"known here: {', '.join(fields)}")
+    values = {}
+    for name, field in fields.items():
+        if name in table:
+            values[field.name] = _read(hints[field.name], table[name], f"{prefix}{name}")
+        elif field.default is dataclasses.MISSING:
+            _demand(type(None) in typing.get_args(hints[field.name]), f"{prefix}{name}", "nothing", "this key is required")
+            values[field.name] = None
+    return kind(**values)
 
 
 def _read_tuple(kinds: tuple[Any, ...], value: Any, key: str) -> tuple[Any, ...]:

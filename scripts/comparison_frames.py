@@ -20,7 +20,7 @@ def draw_frames(scene: Scene, count: int, clutter: float, seed: int) -> Iterator
     Every pixel is clutter with probability `clutter`, independently. The states depend on the seed alone: they are the same at every
     density, and the clutter of a lower density is part of that of a higher one.
     """
-    states = np.random.default_rng([seed, 0]).uniform(scene.domain.lower, scene.domain.upper, (count, 4))
+    states = scene.domain.uniform(np.random.default_rng([seed, 0]), count)
     for number, state in enumerate(states):
         lit_by_chance = np.random.default_rng([seed, 1, number]).random(scene.camera.shape) < clutter
         yield state, runway_image(scene, state) | lit_by_chance.astype(np.uint8)

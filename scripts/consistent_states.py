@@ -170,8 +170,7 @@ class Sampler:
 
     def _allowed(self, states: Floats) -> Integers:
         """Numbers of the states that lie in the domain and lack no more lit pixels than the budget."""
-        domain = self._scene.domain
-        inside = np.flatnonzero(((domain.lower <= states) & (states <= domain.upper)).all(axis=1))
+        inside = np.flatnonzero(self._scene.domain.contains(states))
         return inside[self._dark.missed(self._scene, states[inside]) <= self._budget]
 
     def _kept(self, states: Floats) -> Floats:

@@ -70,15 +70,16 @@ class Flight:
         budget = min(int(rng.choice(BUDGETS)), largest)
         most = (stage.upper - stage.lower) * rng.uniform(0.02, 0.3)
         motion = Motion(-most, most)
-        return Flight(stage, budget, rng, motion, rng.uniform(stage.lower, stage.upper), most)
+        return Flight(stage, budget, rng, motion, stage.scene.domain.uniform(rng, 1)[0], most)
 
     def step(self) -> None:
         """The next state: at one of the motion's limits, or at any rate within; the domain's faces turn it back."""
         share = self.rng.uniform(-1, 1, 4)
         rate = self.motion.rate_upper * (np.sign(share) if self.rng.random() < 0.3 else share) * (1 - 1e-9)
         after = self.state + rate * (FRAME_US / 1e6)
-        outside = (after < self.stage.lower) | (after > self.stage.upper)
-        self.state = np.where(outside, self.state, after)
+        domain = self.stage.scene.domain
+        turned = np.where(domain.nearest(after) != after, self.state, after)
+        self.state = turned if domain.contains(turned) else self.state
 
     def frame(self, state: Floats, missed: int) -> Frame:
         """A state's image with so many of its pixels dark, side by side or anywhere, and clutter everywhere else."""
@@ -104,11 +105,13 @@ class Flight:
     def jump(self) -> None:
         """Goes to a state that is a third of the domain away on every axis."""
         size = self.stage.upper - self.stage.lower
-        self.state = self.stage.lower + (self.state - self.stage.lower + size / 3) % np.where(size > 0, size, 1)
+        self.state = self.stage.scene.domain.nearest(
+            self.stage.lower + (self.state - self.stage.lower + size / 3) % np.where(size > 0, size, 1)
+        )
 
     def elsewhere(self) -> Floats:
         """A state of the domain that has nothing to do with the flight."""
-        return self.rng.uniform(self.stage.lower, self.stage.upper)
+        return self.stage.scene.domain.uniform(self.rng, 1)[0]
 
 
 def holds(box: Box | None, state: Floats) -> bool:

@@ -63,7 +63,7 @@ def with_a_pitch_reference(path: Path | None, budget: int, frames: int, clutter:
     estimator, rng = Estimator.load(path, missed_budget=budget), np.random.default_rng([seed, budget])
     widths: list[list[Floats]] = [[] for _ in (None, *PLUS_MINUS_RAD)]
     for _ in track(range(frames), f"m = {budget}", console=console, transient=True):
-        state = rng.uniform(estimator.domain.lower, estimator.domain.upper)
+        state = estimator.scene.domain.uniform(rng, 1)[0]
         frame = seen(estimator, state, budget, clutter, rng)
         widths[0].append(half_widths(estimator.estimate(frame), state))
         for place, error in enumerate(PLUS_MINUS_RAD, start=1):
@@ -80,7 +80,7 @@ def tracked(
     estimator, rng = Estimator.load(path, missed_budget=budget), np.random.default_rng([seed, budget, missed])
     alone, followed, ratios = [], [], []
     for _ in track(range(flights), f"m = {budget}, {missed} missed", console=console, transient=True):
-        tracker, state = Tracker(estimator, Motion(-RATES, RATES)), rng.uniform(estimator.domain.lower, estimator.domain.upper)
+        tracker, state = Tracker(estimator, Motion(-RATES, RATES)), estimator.scene.domain.uniform(rng, 1)[0]
         rate, before = rng.uniform(-RATES, RATES), state
         for number in range(FLIGHT_FRAMES):
             frame = seen(estimator, state, missed, clutter, rng)
@@ -95,7 +95,7 @@ def tracked(
                 ratios.append((between - begun) / (time.thread_time() - between))
             rate, before = rng.uniform(-RATES, RATES) if rng.random() < 0.1 else rate, state
             after = state + rate * (1 - 1e-9) * FRAME_US / 1e6
-            outside = (after < estimator.domain.lower) | (after > estimator.domain.upper)
+            outside = estimator.scene.domain.nearest(after) != after
             rate, state = np.where(outside, -rate, rate), np.where(outside, state, after)
     return np.median(alone, axis=0), np.median(followed, axis=0), float(np.median(ratios))
 

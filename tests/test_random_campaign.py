@@ -88,7 +88,7 @@ def test_scenes_are_of_every_kind_and_size() -> None:
     assert max(scene.domain.cell_count for scene in scenes) == 81
     assert max(np.abs(scene.domain.lower[[1, 3]]).max() for scene in scenes) > 5e4
     for axis in range(4):
-        assert {scene.domain.axes[axis].width > 0 for scene in scenes} == {False, True}
+        assert {bool(scene.domain.fixed[axis]) for scene in scenes} == {False, True}
     farthest = [scene.runway.ends_z_m.max() + (scene.domain.lower[3] + scene.domain.upper[3]) / 2 for scene in scenes]
     assert 2500 < max(farthest) < 3000.1
 

@@ -74,10 +74,10 @@ def test_the_papers_scene_is_read(paper_scene: Scene) -> None:
 
 def test_cells_of_an_axis_share_their_borders_and_a_fixed_axis_has_one_value(paper_scene: Scene) -> None:
     for axis in paper_scene.domain.axes:
-        edges = axis.edges
-        assert len(edges) == len(axis.centres) + 1
-        assert np.diff(edges) == pytest.approx(np.full(len(axis.centres), axis.width), abs=1e-12)
-    assert paper_scene.domain.x_m.edges.tolist() == [0.0, 0.0]
+        assert isinstance(axis, Axis)
+        assert len(axis.borders) == len(axis.centres) + 1
+        assert np.diff(axis.borders) == pytest.approx(np.full(len(axis.centres), axis.width), abs=1e-12)
+    assert paper_scene.domain.x_m.borders.tolist() == [0.0, 0.0]
 
 
 def test_the_smallest_scene_takes_every_default() -> None:
@@ -418,7 +418,8 @@ def scene_or_refusal(tables: Any) -> Scene | None:
     assert Scene.from_dict(scene.to_dict()) == scene
     corners = np.array(list(itertools.product(*zip(scene.domain.lower, scene.domain.upper, strict=True))))
     assert np.isfinite(project(scene, corners)).all()
-    assert all((np.diff(axis.edges) > 0).all() for axis in scene.domain.axes if axis.width > 0)
+    borders = [scene.domain.borders_along(axis) for axis in range(4)]
+    assert all((np.diff(each) > 0).all() for each, fixed in zip(borders, scene.domain.fixed, strict=True) if not fixed)
     return scene
 
 

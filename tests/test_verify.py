@@ -34,13 +34,14 @@ from build_model.pixel_mask import runs_of
 from build_model.verify import cli
 from build_model.verify.ball_camera import PRECISION_BITS, BallCamera, BallEntry, Ends, Slice, columns, columns_crossed
 from build_model.verify.box_claims import check_boxes
+from build_model.verify.cell_boxes import axis_borders, cell_boxes
 from build_model.verify.cell_claim import cell_claims
 from build_model.verify.cell_proof import prove_cell
 from build_model.verify.counterexample import Counterexample, Refuted
 from build_model.verify.displacement import displacement_px
 from build_model.verify.model_graph import read_tables
 from build_model.verify.outputs import check_outputs
-from build_model.verify.proof import axis_borders, cell_boxes, verify_model
+from build_model.verify.proof import verify_model
 from build_model.window import Bits
 from runtime.camera import ground_scale, project, project_points
 from runtime.image import runway_image
@@ -758,7 +759,8 @@ def test_bounds_tend_to_what_the_states_show() -> None:
 def test_borders_are_the_runtimes() -> None:
     for scene in (*SCENES.values(), Scene.load(PAPER_TOML)):
         for axis in scene.domain.axes:
-            assert axis_borders(axis) == axis.edges.tolist()
+            assert axis is not None
+            assert axis_borders(axis) == axis.borders.tolist()
 
 
 def test_displacement_holds_every_camera_within_the_calibration() -> None:

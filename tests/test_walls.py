@@ -30,6 +30,7 @@ SHARED_WITH_VERIFIER = {
     "build_model.window",
     "runtime",
     "runtime.assumptions",  # words
+    "runtime.domain",  # how a scene is divided into cells, which the verifier derives anew
     "runtime.errors",
     "runtime.model",
     "runtime.model.format",
@@ -45,7 +46,9 @@ SHARED_WITH_VERIFIER = {
     "runtime.model.operators.tensor",
     "runtime.model.protobuf",
     "runtime.scene",
+    "runtime.scene_error",
     "runtime.terminal",  # what the command prints on
+    "runtime.turn",  # the scene's reader takes the tangents of a glide's angles with it; the verifier takes them anew
 }
 """All that the proof may load of the project beside its own: no mask, bound or rounding of the build, no state network, no refinement."""
 

@@ -2,7 +2,7 @@
 
 What is proved, and by what arithmetic:
 
-    cells      the borders are the float64 numbers nearest to the scene's: exact fractions
+    cells      are those of the scene's domain: exact fractions, and balls for the altitudes of a glide (`build_model.verify.cell_boxes`)
     graph      NN_F is, node by node and bit by bit, the graph of the tables in the file (`build_model.verify.model_graph`); and on frames
                drawn at random, onnxruntime's outputs are those that the masks define, counted pixel by pixel: integers
     boxes      of states, scales and reference rows are what the refinement takes for granted (`build_model.verify.box_claims`)
@@ -16,11 +16,9 @@ No mask, bound or rounding of the build is used; shared with it are the scene's 
 from __future__ import annotations
 
 import hashlib
-import itertools
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 from typing import Any, cast
 
@@ -32,6 +30,7 @@ from google.protobuf.message import DecodeError
 from build_model.filter_tables import FilterTables
 from build_model.partition import Partition
 from build_model.verify.box_claims import check_boxes, demand_of_all
+from build_model.verify.cell_boxes import cell_boxes
 from build_model.verify.cell_claim import cell_claims
 from build_model.verify.cell_proof import CellProof, prove_cell
 from build_model.verify.counterexample import Counterexample, Refuted, demand
@@ -42,7 +41,7 @@ from runtime.assumptions import assumptions
 from runtime.errors import one_line
 from runtime.model.format import METADATA_KEY, PADDING_SIZE, ModelError
 from runtime.model.model_file import parse_model
-from runtime.scene import Axis, Scene, SceneError
+from runtime.scene import Scene, SceneError
 
 Progress = Callable[[int, int], None]
 """Called with cells proved and cells in all."""
@@ -134,23 +133,6 @@ def _opened(content: bytes, name: str) -> tuple[onnx.ModelProto, dict[str, Any],
         return model, metadata, Scene.from_dict(metadata.get("scene", {}))
     except SceneError as error:
         raise ModelError(f"{name}: the scene in its metadata is unusable ({error}); export it again with export-model") from error
-
-
-def axis_borders(axis: Axis) -> list[float]:
-    """Borders of an axis's cells, ascending: half-way between its centres, and half a width beyond the outermost.
-
-    Each is the float64 number nearest to the exact fraction.
-    """
-    centres, half = [Fraction(centre) for centre in axis.centres], Fraction(axis.width) / 2
-    middles = [(left + right) / 2 for left, right in itertools.pairwise(centres)]
-    return [float(border) for border in (centres[0] - half, *middles, centres[-1] + half)]
-
-
-def cell_boxes(scene: Scene) -> Partition:
-    """The cells as the model's documentation defines them: row-major over the intervals of theta, x, y and z, sharing their borders."""
-    intervals = [list(itertools.pairwise(axis_borders(axis))) for axis in scene.domain.axes]
-    boxes = np.array(list(itertools.product(*intervals)))
-    return Partition(lower=boxes[:, :, 0], upper=boxes[:, :, 1])
 
 
 def _check_all_but_masks(model: onnx.ModelProto, metadata: dict[str, Any], scene: Scene) -> tuple[FilterTables, float]:

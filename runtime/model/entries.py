@@ -3,8 +3,8 @@
 What the loader guarantees, whoever wrote the file, of every set that `Entries.sets` gives; H is the frame's height, v_h(theta) =
 v0 - F_v tan(theta) the horizon, (theta, x, y, z) a state of the set's box, all numbers float64:
 
-1. All bounds are finite, and each lower one is at most its upper one. theta, x, y and z lie in the domain, and an axis of width 0 is its
-   value; so what `runtime.scene` demands of states of the domain holds of every state of the box: y and the distances of all ends are
+1. All bounds are finite, and each lower one is at most its upper one. theta, x, y and z lie in the domain's hull, and an axis of width 0 is
+   its value; so what `runtime.scene` demands of all states of the hull holds of every state of the box: y and the distances of all ends are
    above 0, all ends lie in front of the camera, and the margins of `runtime.rounding` exceed float64's error on rows and columns in view.
 2. The reference row is in the frame or a pixel below it, 0 <= v_ref <= H + 1, and `BELOW_HORIZON_PX` or more below the horizon: v_ref -
    v_h(theta) >= 0.5. So s(theta, t_ref) > 0, and R = s(theta, t) / s(theta, t_ref) = (v - v_h) / (v_ref - v_h), at a row v below the

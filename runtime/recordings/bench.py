@@ -57,7 +57,7 @@ class Latency:
 def cluttered_frames(scene: Scene, density: float, count: int, seed: int) -> Frames:
     """Exact images of random states of the domain; each pixel is lit besides with probability `density`."""
     rng = np.random.default_rng(seed)
-    images = (runway_image(scene, rng.uniform(scene.domain.lower, scene.domain.upper)) for _ in range(count))
+    images = (runway_image(scene, scene.domain.uniform(rng, 1)[0]) for _ in range(count))
     return [image | (rng.random(image.shape) < density) for image in images]
 
 

@@ -59,7 +59,7 @@ class Judgement:
 def judge(scene: Scene, frame: NDArray[np.uint8], estimate: Estimate, truth: NDArray[np.float64], missed_budget: int) -> Judgement:
     """The window's frame and estimate, made with that budget, against its true state (4,)."""
     lacking = shortfall(scene, frame, truth)
-    in_domain = bool(((scene.domain.lower <= truth) & (truth <= scene.domain.upper)).all())
+    in_domain = bool(scene.domain.contains(truth))
     error = None if estimate.state is None else estimate.state - truth
     inside = estimate.box is not None and estimate.box.contains(truth)
     return Judgement(truth, lacking, in_domain and lacking.missed <= missed_budget, inside, error)

@@ -12,7 +12,8 @@ from rational_image import RationalState, RationalView
 from build_model.export import export_model
 from build_model.partition import partition
 from runtime import Scene
-from runtime.scene import Axis, Calibration, EstimatorTraining, Runway, Tolerance
+from runtime.domain import AnyAxis, Axis, Domain, Edges
+from runtime.scene import Calibration, EstimatorTraining, Runway, Tolerance
 
 OFF_BY = Calibration(roll_rad=0.001, yaw_rad=0.0005, focal_relative=0.001, principal_px=0.2)
 SHIFTED = Calibration(principal_px=0.99)
@@ -55,8 +56,9 @@ def cut_scene(scene: Scene, side: str) -> Scene:
     """
     down = side == "bottom"
     picks = (down, None, not down, down)
-    axes = [few_cells(axis, first) for axis, first in zip(scene.domain.axes, picks, strict=True)]
-    scene = replace(scene, domain=replace(scene.domain, theta_rad=axes[0], x_m=axes[1], y_m=axes[2], z_m=axes[3]))
+    axes = zip(("theta_rad", "x_m", "y_m", "z_m"), scene.domain.axes, picks, strict=True)
+    fewer = {name: few_cells(axis, first) for name, axis, first in axes if axis is not None}
+    scene = replace(scene, domain=replace(scene.domain, **fewer))
     ends = corner_ends(scene)
     if side != "left":
         rows = ends[..., 1]
@@ -69,12 +71,11 @@ def cut_scene(scene: Scene, side: str) -> Scene:
 
 def staggered_scene(scene: Scene, above: bool) -> Scene:
     """One small cell, none of whose states shows the last marking, which lies beyond the others or is shorter: one misses it by little."""
-    axes = [Axis(few_cells(axis, None).centres, axis.width / SMALL_CELL) for axis in scene.domain.axes]
+    axes = [small_cell(scene.domain, axis) for axis in range(4)]
     *others, last = scene.runway.markings
     third = last.length_m / 3
     moved = replace(last, start_z_m=last.start_z_m + 2 * third) if above else replace(last, length_m=third)
-    domain = replace(scene.domain, theta_rad=axes[0], x_m=axes[1], y_m=axes[2], z_m=axes[3])
-    scene = replace(scene, domain=domain, runway=Runway((*others, moved)))
+    scene = replace(scene, domain=Domain(*axes), runway=Runway((*others, moved)))
     rows = corner_ends(scene)[:, -1, :, 1]
     return moved_down(scene, -MISSED_BY_PX - rows[:, 0].max() if above else scene.camera.height + MISSED_BY_PX - rows[:, 1].min())
 
@@ -84,11 +85,23 @@ def moved_down(scene: Scene, by_px: float) -> Scene:
     return replace(scene, camera=replace(scene.camera, principal_point=(scene.camera.u0, scene.camera.v0 + by_px)))
 
 
-def few_cells(axis: Axis, first: bool | None) -> Axis:
+def few_cells(axis: AnyAxis, first: bool | None) -> AnyAxis:
     """The first or the last two cells of an axis; the middle one, or the one there is, where it does not matter."""
-    if first is None:
-        return Axis(axis.centres[len(axis.centres) // 2 :][:1], axis.width)
-    return Axis(axis.centres[:2] if first else axis.centres[-2:], axis.width)
+    cells = len(axis.borders) - 1
+    chosen = slice(cells // 2, cells // 2 + 1) if first is None else slice(0, 2) if first else slice(max(cells - 2, 0), cells)
+    if isinstance(axis, Axis):
+        return Axis(axis.centres[chosen], axis.width)
+    return Edges(tuple(axis.borders[chosen.start : chosen.stop + 1].tolist()))
+
+
+def small_cell(domain: Domain, number: int) -> Axis:
+    """The middle of an axis's middle cell, `SMALL_CELL` times smaller; of a glide's altitudes, that of the middle cell of z."""
+    axis = domain.axes[number]
+    if isinstance(axis, Axis):
+        return Axis(axis.centres[len(axis.centres) // 2 :][:1], axis.width / SMALL_CELL)
+    borders = domain.altitude_borders[len(domain.altitude_borders) // 2] if axis is None else axis.borders
+    low, high = borders[(len(borders) - 1) // 2 :][:2].tolist()
+    return Axis(((low + high) / 2,), (high - low) / SMALL_CELL)
 
 
 def corner_ends(scene: Scene) -> NDArray[np.float64]:

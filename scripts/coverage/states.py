@@ -68,7 +68,15 @@ class Stage:
 
     def contains(self, state: RationalState) -> bool:
         """True if the state lies in the domain."""
-        return state.within(self.lower, self.upper)
+        return state.within(self.lower, self.upper) and (self.scene.domain.glide is None or len(self.cells_of(state)) > 0)
+
+    def altitudes_at(self, z: Fraction) -> tuple[float, float]:
+        """Smallest and largest altitude of the domain's states at a distance, exactly."""
+        domain = self.scene.domain
+        borders = domain.z_m.borders.tolist()
+        met = [cell for cell, (near, far) in enumerate(itertools.pairwise(borders)) if near <= z <= far]
+        altitudes = domain.altitude_borders[met]
+        return float(altitudes[:, 0].min()), float(altitudes[:, -1].max())
 
     def unwitnessed(self, image: RunwayImage, frame: Frame) -> int:
         """Number of pixels of an image without a lit pixel of the frame within the tolerance; what is out of view counts as lit."""
@@ -101,7 +109,7 @@ def spatial_mask(path: str, cell: int) -> Frame:
 
 def uniform(rng: Rng, stage: Stage) -> RationalState:
     """A random state of the domain."""
-    return into_domain(stage, RationalState.near(rng.uniform(stage.lower, stage.upper)))
+    return into_domain(stage, RationalState.near(stage.scene.domain.uniform(rng, 1)[0]))
 
 
 def tangent_within(theta: float, low: float, high: float) -> Fraction:
@@ -115,9 +123,11 @@ def tangent_within(theta: float, low: float, high: float) -> Fraction:
 
 
 def into_domain(stage: Stage, state: RationalState) -> RationalState:
-    """The state of the domain that is closest, axis by axis."""
+    """The state of the domain that is closest, axis by axis; in altitude, of those that it has at that distance."""
     (low, *lowest), (high, *highest) = stage.lower.tolist(), stage.upper.tolist()
-    lengths = zip((state.x, state.y, state.z), lowest, highest, strict=True)
+    z = min(max(state.z, Fraction(lowest[2])), Fraction(highest[2]))
+    lowest[1], highest[1] = stage.altitudes_at(z)
+    lengths = zip((state.x, state.y, z), lowest, highest, strict=True)
     clipped = [min(max(value, Fraction(least)), Fraction(most)) for value, least, most in lengths]
     inside = angle_is_at_least(state.tangent, low) and angle_is_at_least(-state.tangent, -high)
     return RationalState(state.tangent if inside else tangent_within(state.floats[0], low, high), *clipped)
@@ -125,7 +135,7 @@ def into_domain(stage: Stage, state: RationalState) -> RationalState:
 
 def some_free_axes(rng: Rng, stage: Stage) -> list[int]:
     """One or more of the axes that have a width."""
-    free = [axis for axis, sides in enumerate(stage.scene.domain.axes) if sides.width > 0]
+    free = np.flatnonzero(~stage.scene.domain.fixed).tolist()
     return rng.choice(free, size=rng.integers(1, len(free) + 1), replace=False).tolist() if len(free) else []
 
 
@@ -144,7 +154,7 @@ def on_faces(rng: Rng, stage: Stage) -> RationalState:
     """On a face, an edge or a corner of a cell, of the domain's among them, or a hair beside it."""
     state = uniform(rng, stage)
     for axis in some_free_axes(rng, stage):
-        state = moved(state, axis, Fraction(rng.choice(stage.scene.domain.axes[axis].edges)) + nudge(rng))
+        state = moved(state, axis, Fraction(rng.choice(stage.scene.domain.borders_along(axis))) + nudge(rng))
     return into_domain(stage, state)
 
 
@@ -189,10 +199,12 @@ def solved_for_border(rng: Rng, stage: Stage, state: RationalState) -> RationalS
 def outside(rng: Rng, stage: Stage, by: float) -> RationalState:
     """Outside of one or more faces of the domain by up to `by`, often by a hair."""
     state = uniform(rng, stage)
+    lowest, highest = stage.lower.tolist(), stage.upper.tolist()
+    lowest[2], highest[2] = stage.altitudes_at(state.z)
     for axis in some_free_axes(rng, stage):
         distance = Fraction(rng.choice([*NUDGES, *rng.uniform(0, by, 3)]))
         below = rng.random() < 0.5
-        state = moved(state, axis, Fraction(stage.lower[axis]) - distance if below else Fraction(stage.upper[axis]) + distance)
+        state = moved(state, axis, Fraction(lowest[axis]) - distance if below else Fraction(highest[axis]) + distance)
     return state
 
 
@@ -201,7 +213,7 @@ def cut_by_the_frame(rng: Rng, stage: Stage) -> RationalState:
     kind = rng.random()
     if kind < 0.2:
         return on_faces(rng, stage)
-    states = stage.lower + rng.beta(0.3, 0.3, (TRIES, 4)) * (stage.upper - stage.lower)
+    states = stage.scene.domain.nearest(stage.lower + rng.beta(0.3, 0.3, (TRIES, 4)) * (stage.upper - stage.lower))
     ends = project(stage.scene, states)
     beyond = np.maximum(-ends, ends - [stage.view.width, stage.view.height]).max(axis=3)
     whole = beyond.min(axis=2)

@@ -19,6 +19,7 @@ from random_scenes.pitched_state import as_fixed
 from random_scenes.sights import Floats, Rng
 from runtime import Box, Scene
 from runtime.camera import ground_scale
+from runtime.domain import Domain
 from runtime.image import dilated, lit_columns
 
 PROPOSALS = 24
@@ -86,7 +87,7 @@ def extreme_state(rng: Rng, picture: Picture, missed: int) -> Extreme | None:
         found = value.max() > sign * best[axis]
         best, step = (proposals[value.argmax()], step * GROWTH) if found else (best, step * SHRINKAGE)
     bound = stage.upper[axis] if sign > 0 else stage.lower[axis]
-    outermost = RationalState.near(to_border(witnesses, best, axis, bound, missed))
+    outermost = RationalState.near(to_border(witnesses, stage.scene.domain, best, axis, bound, missed))
     return Extreme(as_fixed(stage, into_domain(stage, outermost)), axis, sign)
 
 
@@ -99,17 +100,17 @@ def proposed(rng: Rng, stage: Stage, state: Floats, step: float) -> Floats:
     before, after = ground_scale(camera, state[0], 1.0, rows), ground_scale(camera, states[half, 0], 1.0, rows)
     seen = (before > 0) & (after > 0)
     states[half, 2] = np.where(seen, states[half, 2] * after / np.where(seen, before, 1.0), states[half, 2])
-    return np.clip(states, stage.lower, stage.upper)
+    return stage.scene.domain.nearest(states)
 
 
-def to_border(witnesses: Witnesses, state: Floats, axis: int, bound: float, missed: int) -> Floats:
-    """The state moved along one axis, towards `bound`, as far as the frame allows without a gap."""
+def to_border(witnesses: Witnesses, domain: Domain, state: Floats, axis: int, bound: float, missed: int) -> Floats:
+    """The state moved along one axis, towards `bound`, as far as frame and domain allow without a gap."""
     near, far = float(state[axis]), float(bound)
     for _ in range(SECTIONS):
         values = np.linspace(near, far, PROPOSALS + 1)
         states = np.repeat(state[None], PROPOSALS + 1, axis=0)
         states[:, axis] = values
-        allowed = witnesses.missed(states) <= missed
+        allowed = (witnesses.missed(states) <= missed) & domain.contains(states)
         if allowed.all():
             near = far
             break

@@ -15,9 +15,11 @@ import numpy as np
 
 from build_model.calibration import displacement_px
 from build_model.pixel_mask import Window
+from random_scenes.divisions import EQUAL, Division, draw_division, stretch_of
 from random_scenes.sights import PLACES, Floats, Rng, Sight, UndrawableError, draw_camera, mirrored
 from runtime.camera import ground_scale, project, row_of_point
-from runtime.scene import Axis, Bank, Calibration, Domain, EstimatorTraining, Marking, Runway, Scene, SceneError, Tolerance
+from runtime.domain import Domain, Edges, Growth
+from runtime.scene import STATE_NAMES, Bank, Calibration, EstimatorTraining, Marking, Runway, Scene, SceneError, Tolerance
 
 FARTHEST_SHIFT_M = 1e5
 MOST_CELLS, MOST_OF_AN_AXIS = 81, 3
@@ -122,6 +124,7 @@ class Plan:
     counts: Floats
     column_px: float
     lateral_px: float
+    division: Division = EQUAL
 
     @property
     def widths(self) -> Floats:
@@ -135,15 +138,16 @@ class Plan:
         """The bank that serves the cells."""
         return Bank(int(self.bins[0]), int(self.bins[3]), self.column_px, self.lateral_px)
 
-    def axes(self, centres: tuple[float, ...]) -> list[Axis]:
-        """The domain's axes about a state (4,)."""
-        return [axis_about(*parts) for parts in zip(centres, self.widths.tolist(), self.counts.astype(int).tolist(), strict=True)]
+    def domain(self, centres: tuple[float, ...]) -> Domain:
+        """The domain about a state (4,)."""
+        return self.division.domain(centres, self.widths.tolist(), self.counts.astype(int).tolist())
 
     def affordable(self, scene: Scene) -> bool:
         """True if the bank takes a second or two. Raises `UndrawableError` if nothing is in view."""
         window, markings = window_in_view(scene), len(scene.runway.markings)
         pixels = (window.bottom - window.top) * (window.right - window.left)
         entries, cells = math.prod(self.bins * np.maximum(self.shares, 1)), scene.domain.cell_count
+        entries *= stretch_of(scene.domain, self.widths)
         masks = SLICES + 3 * entries  # O, K, and O again within S
         rows = cells * (SLICES + entries) * markings * scene.camera.height
         painted = masks * pixels <= MOST_AT_ONCE and cells * masks * pixels * markings <= MOST_PAINTED
@@ -161,12 +165,6 @@ class Plan:
 def one_less(numbers: Floats) -> Floats:
     """The numbers with the largest one less."""
     return numbers - (np.arange(len(numbers)) == numbers.argmax())
-
-
-def axis_about(centre: float, width: float, count: int) -> Axis:
-    """Cells about a centre; one if they have no width."""
-    count = count if width > 0 else 1
-    return Axis(tuple(centre + width * (place - (count - 1) / 2) for place in range(count)), width)
 
 
 def draw_plan(rng: Rng, sight: Sight) -> Plan:
@@ -191,6 +189,7 @@ def draw_plan(rng: Rng, sight: Sight) -> Plan:
         counts=np.where(fixed, 1, counts).astype(float),
         column_px=column_px,
         lateral_px=lateral_px,
+        division=draw_division(rng.spawn(1)[0], MOST_OF_AN_AXIS),
     )
 
 
@@ -241,7 +240,7 @@ class Setting:
             Marking(f"m{number}", float(across) + self.across_m, float(near) - z_m, float(far - near))
             for number, (across, (near, far)) in enumerate(zip(sight.across, sight.ahead, strict=True))
         ]
-        domain = Domain(*plan.axes((sight.outlook.theta, self.across_m, sight.outlook.y, z_m)))
+        domain = plan.domain((sight.outlook.theta, self.across_m, sight.outlook.y, z_m))
         return Scene(sight.outlook.camera, Runway(tuple(markings)), domain, plan.bank, calibration, tolerance, UNTRAINED)
 
 
@@ -326,7 +325,8 @@ def kinds_of(scene: Scene, setting: Setting) -> list[str]:
     """What else a scene is an instance of."""
     camera, cells = scene.camera, scene.domain.cell_count
     pixels = camera.width * camera.height
-    free = [name for name, axis in zip(("theta", "x", "y", "z"), scene.domain.axes, strict=True) if axis.width > 0]
+    domain = scene.domain
+    free = [name for name, fixed in zip(STATE_NAMES, domain.fixed, strict=True) if not fixed]
     kinds = {
         f"{len(scene.runway.markings)} markings": True,
         "x free": "x" in free,
@@ -335,6 +335,9 @@ def kinds_of(scene: Scene, setting: Setting) -> list[str]:
         "1 cell": cells == 1,
         "2 to 9 cells": 2 <= cells <= 9,
         "10 to 81 cells": cells >= 10,
+        "unlike edges": any(isinstance(axis, Edges) and len(axis.edges) > 2 for axis in domain.axes),
+        "cells by a ratio": any(isinstance(axis, Growth) for axis in domain.axes),
+        "glide": domain.glide is not None,
         "coordinates above 1 km": max(abs(setting.across_m), abs(setting.along_m)) > 1000,
         "frame below 10,000 px": pixels < 1e4,
         "frame above 1,000,000 px": pixels > 1e6,

@@ -108,9 +108,9 @@ def test_states_that_hypothesis_finds(estimator_of: EstimatorOf, name: str, data
     estimator = estimator_of(name)
     scene = estimator.scene
     state = data.draw(states_of(scene))
-    for axis, edges in enumerate(axis.edges for axis in scene.domain.axes):
+    for axis in range(4):
         if data.draw(st.booleans()):
-            state[axis] = data.draw(st.sampled_from(edges.tolist()))
+            state[axis] = data.draw(st.sampled_from(scene.domain.borders_along(axis).tolist()))
     check(estimator, state, runway_image(scene, state), random_clutter(np.random.default_rng(seed), scene.camera.shape, density))
 
 
@@ -247,11 +247,11 @@ def test_bounded_clutter(model_of: Callable, name: str) -> None:
     for extra in (0, 5):
         estimator = Estimator.load(model_of(name), missed_budget=1, extra_budget=extra)
         scene, rng = estimator.scene, np.random.default_rng(108)
-        axes = scene.domain.axes
+        borders = [scene.domain.borders_along(axis) for axis in range(4)]
         for number in range(10):
             state = rng.uniform(scene.domain.lower, scene.domain.upper)
-            place = [int(np.searchsorted(axis.edges[1:-1], value)) for axis, value in zip(axes, state, strict=True)]
-            cell = int(np.ravel_multi_index(place, [len(axis.centres) for axis in axes]))
+            place = [int(np.searchsorted(inner[1:-1], value)) for inner, value in zip(borders, state, strict=True)]
+            cell = int(np.ravel_multi_index(place, scene.domain.cell_counts))
             image = runway_image(scene, state)
             spatial = estimator.spatial_mask(cell)
             clutter = random_clutter(rng, scene.camera.shape, 0.3 * (number % 2)) & ~spatial
