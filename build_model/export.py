@@ -28,19 +28,21 @@ from numpy.typing import NDArray
 from onnx import TensorProto, helper
 
 from build_model.assembly import assemble
+from build_model.bank_graph import GraphWriter
 from build_model.calibration import check_calibration
 from build_model.constant_network import constant_network
-from build_model.filter_graph import GraphWriter, filter_graph
-from build_model.filter_tables import FilterTables
+from build_model.filter_graph import filter_graph
+from build_model.filter_tables import BankTables
 from build_model.hough_bank import CellBank, cell_bank
 from build_model.paper.paper_bound import PaperBound, paper_bound
 from build_model.partition import partition
 from build_model.state_network import TrainingReport, state_graph, train_state_network
 from build_model.user_network import bare, user_network
+from build_model.window_bank import CellWindows, cell_windows
 from runtime.assumptions import assumptions
 from runtime.model.format import FORMAT_VERSION, IR_VERSION, METADATA_KEY, NETWORK_OUTPUT, NETWORK_PREFIX, OPSET, metadata_digest
 from runtime.rounding import OUTWARD_PX
-from runtime.scene import Scene
+from runtime.scene import Scene, WindowedBank
 from runtime.whole_file import write_whole
 
 Progress = Callable[[str, int, int, float | None], None]
@@ -121,9 +123,9 @@ def export_model(
         write_whole(Path(path), content)
     return ExportReport(
         cells=len(banks),
-        entries=sum(len(bank) for bank in banks),
+        entries=tables.entries,
         smallest_must_light=tables.smallest_must_light,
-        spatial_pixels=np.concatenate([bank.spatial.sizes(1) for bank in banks]),
+        spatial_pixels=np.array([bank.spatial_pixels for bank in banks]),
         displacement_px=shift_px,
         paper_bounds=bounds,
         file_bytes=len(content),
@@ -133,14 +135,15 @@ def export_model(
     )
 
 
-def build_banks(scene: Scene, jobs: int = 1, progress: Progress = _silent, dask: str | None = None) -> list[CellBank]:
-    """S, entries, O and K of every cell, in the order of the partition.
+def build_banks(scene: Scene, jobs: int = 1, progress: Progress = _silent, dask: str | None = None) -> list[CellBank] | list[CellWindows]:
+    """S, entries, and O and K or windows of every cell, in the order of the partition.
 
     Cells are independent: `jobs` local processes build them, or the workers of the dask.distributed scheduler at the address `dask`,
     who must have the same version of this package; cells of a worker that is lost are built by another one. Raises `ClusterError`.
     """
     cells = partition(scene)
-    work = (joblib.delayed(cell_bank)(scene, lower, upper) for lower, upper in zip(cells.lower, cells.upper, strict=True))
+    build = cell_windows if isinstance(scene.bank, WindowedBank) else cell_bank
+    work = (joblib.delayed(build)(scene, lower, upper) for lower, upper in zip(cells.lower, cells.upper, strict=True))
     banks = []
     with _workers(jobs, dask):
         for bank in joblib.Parallel(return_as="generator")(work):
@@ -228,7 +231,7 @@ def _joined(filter_part: onnx.GraphProto, network: onnx.GraphProto) -> onnx.Grap
 
 def _metadata(
     scene: Scene,
-    tables: FilterTables,
+    tables: BankTables,
     graph: onnx.GraphProto,
     shift_px: float,
     bounds: list[PaperBound | None],

@@ -27,7 +27,7 @@ from build_model.spatial_filter import reference_row, sliced, spatial_filter
 from build_model.window import Bits, Window
 from runtime.model.limits import SCALE_STEP, SMALLEST_LEVER_M
 from runtime.rounding import float32_above, float32_below, inverted
-from runtime.scene import STATE_NAMES, Scene, SceneError
+from runtime.scene import STATE_NAMES, Bank, Scene, SceneError
 from runtime.state_set import StateSet, contract, scale_range, tangent_of_row
 
 
@@ -51,14 +51,25 @@ class CellBank:
         return len(self.lines)
 
     @property
+    def spatial_pixels(self) -> int:
+        """Pixels of S."""
+        return int(self.spatial.sizes(1)[0])
+
+    @property
     def must_light_sizes(self) -> NDArray[np.int64]:
         """|K_ij| of every entry, (entries,)."""
         return self.must_light.sizes(len(self))
 
 
+def mask_bank(scene: Scene) -> Bank:
+    """The scene's bank, which is one of masks."""
+    assert isinstance(scene.bank, Bank)
+    return scene.bank
+
+
 def line_boxes(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> LineBoxes:
     """Boxes that together cover the cell [lower, upper], both (4,): equal bins of theta, z and x, and of the scale as fine as needed."""
-    bank = scene.bank
+    bank = mask_bank(scene)
     boxes = []
     for theta, z in itertools.product(sliced(lower[0], upper[0], bank.pitch_bins), sliced(lower[3], upper[3], bank.distance_bins)):
         low, high = lower.copy(), upper.copy()
@@ -75,7 +86,7 @@ def line_boxes(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float
 def _scale_bins(scene: Scene, x: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
     """Intervals of the scale that cover `scale` (2,), above 0, each moving the outermost marking by at most `column_px`: (bins, 2)."""
     lever_m = max(np.abs(scene.runway.x_m[:, None] - x).max(), SMALLEST_LEVER_M)
-    step = max(math.floor(scene.bank.column_px / lever_m / SCALE_STEP), 1) * SCALE_STEP
+    step = max(math.floor(mask_bank(scene).column_px / lever_m / SCALE_STEP), 1) * SCALE_STEP
     edges = np.arange(math.floor(scale[0] / step), math.ceil(scale[1] / step) + 1) * step
     edges[0] = max(edges[0], 2.0 ** (math.frexp(scale[0])[1] - 2))  # a quarter to a half of the smallest scale, where the edge is 0
     return np.stack([edges[:-1], edges[1:]], axis=-1)
