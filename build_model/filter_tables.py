@@ -72,7 +72,10 @@ class WindowTable:
     """How many columns each has, as `start`: an end lies as many times the window's rows behind."""
     span_first: NDArray[np.int16]
     span_stop: NDArray[np.int16]
-    """S: each marking's first column in each row, and the one behind its last, (cells, markings, rows of the window); equal if none."""
+    """S: each marking's first column in each row, and the one behind its last, (cells, markings, rows of the window).
+
+    Where there is none, the first is behind the window's last and the other 0, so that neither is an extreme among cells that have some.
+    """
 
 
 @dataclass(frozen=True)

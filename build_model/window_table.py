@@ -44,9 +44,9 @@ def _places(windows: Windows, window: Window) -> tuple[NDArray[np.int64], NDArra
 
 
 def _spans(spans: Sequence[Spans], window: Window) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """First column and the one behind the last of each marking in each row of the window, counted from its left; equal if none."""
+    """First column and the one behind the last of each marking in each row of the window, counted from its left; all and 0 if none."""
     rows = slice(window.top, window.bottom)
     first, last = (np.stack([getattr(span, side)[:, rows] for span in spans]) for side in ("first", "last"))
     some = first <= last
     columns = window.shape[1]
-    return np.where(some, first - window.left, columns), np.where(some, last + 1 - window.left, columns)
+    return np.where(some, first - window.left, columns), np.where(some, last + 1 - window.left, 0)

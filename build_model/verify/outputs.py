@@ -83,8 +83,7 @@ def defined_by_windows(claims: list[WindowClaim], frame: NDArray[np.uint8], miss
     outputs = _summed_up(claims, [missed <= missed_budget for missed in scores], scores, claims[0].parts)
     shown, columns = _shown(outputs), np.arange(window.shape[1])
     first = np.array([claim.span_first for claim in claims])[shown].min(axis=0)[:, :, None]
-    stop = np.array([claim.span_stop for claim in claims])[shown]
-    stop = np.where(stop > np.array([claim.span_first for claim in claims])[shown], stop, 0).max(axis=0)[:, :, None]
+    stop = np.array([claim.span_stop for claim in claims])[shown].max(axis=0)[:, :, None]
     filtered = np.zeros_like(frame)
     filtered[window.slices] = frame[window.slices] * ((columns >= first) & (columns < stop)).any(axis=0)
     return outputs | {"filtered": filtered, OVERFLOW: np.array(len(passing) > min(bank.places, len(gates)))}

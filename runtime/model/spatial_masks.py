@@ -41,7 +41,7 @@ class SpatialRuns:
 
 @dataclass(frozen=True)
 class SpatialSpans:
-    """The first column of each marking in each row of the window, and the one behind the last, (cells, markings, rows); equal if none."""
+    """The first column of each marking in each row of the window, and the one behind the last, (cells, markings, rows)."""
 
     first: NDArray[np.int16]
     stop: NDArray[np.int16]
@@ -50,7 +50,7 @@ class SpatialSpans:
     def of(tensors: dict[str, NDArray[Any]], shape: tuple[int, int], name: str) -> SpatialSpans:
         """From the initialisers, copied so as not to keep the file. Raises `ModelError` for a column outside the window's `shape`."""
         first, stop = (tensors[f"span_{side}"].copy() for side in ("first", "stop"))
-        if first.min() < 0 or stop.max() > shape[1] or (first > stop).any():
+        if first.min() < 0 or stop.max() > shape[1]:
             raise ModelError(f"{name}: its window or its spatial masks lie outside the frame; export it again with export-model")
         return SpatialSpans(first, stop)
 
