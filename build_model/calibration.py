@@ -1,11 +1,11 @@
 """How far a camera that is off by its stated calibration moves a marking's image, and whether the tolerance covers it.
 
-A ray (a, b, 1), a = (u - u0)/F, b = (v - v0)/F, seen by a camera that is yawed by psi and then rolled by rho:
+A ray (a, b, 1), a = (u - u0)/F_u, b = (v - v0)/F_v, seen by a camera that is yawed by psi and then rolled by rho:
 
     yaw    a -> (a cos(psi) - sin(psi)) / (a sin(psi) + cos(psi))      b -> b / (a sin(psi) + cos(psi))
     roll   a -> a cos(rho) - b sin(rho)                                b -> a sin(rho) + b cos(rho)
 
-after which F is off by a share and the principal point by some px. Each step's displacement is bounded on its own.
+after which F_u and F_v are off by one share and the principal point by some px. Each step's displacement is bounded on its own.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ def displacement_px(scene: Scene, window: Window) -> float:
     if scene.calibration.exact:
         return 0.0
     camera, off = scene.camera, scene.calibration
-    across = max(abs(window.left - camera.u0), abs(window.right - camera.u0)) / camera.focal_px
-    down = max(abs(window.top - camera.v0), abs(window.bottom - camera.v0)) / camera.focal_px
+    across = max(abs(window.left - camera.u0), abs(window.right - camera.u0)) / camera.focal_u_px
+    down = max(abs(window.top - camera.v0), abs(window.bottom - camera.v0)) / camera.focal_v_px
     sine, cosine = math.sin(off.yaw_rad), math.cos(off.yaw_rad)
     depth = cosine - across * sine
     if depth <= 0:
@@ -35,7 +35,7 @@ def displacement_px(scene: Scene, window: Window) -> float:
     shift_down += tall * versine + wide * sine
     shift_across += off.focal_relative * (across + shift_across)
     shift_down += off.focal_relative * (down + shift_down)
-    return float(above(camera.focal_px * max(shift_across, shift_down) + off.principal_px))
+    return float(above(max(camera.focal_u_px * shift_across, camera.focal_v_px * shift_down) + off.principal_px))
 
 
 def check_calibration(scene: Scene, window: Window) -> float:

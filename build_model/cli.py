@@ -14,6 +14,7 @@ from runtime import terminal
 from runtime.assumptions import assumptions
 from runtime.errors import INTERRUPTED, fail
 from runtime.scene import STATE_NAMES, STATE_UNITS
+from runtime.whole_file import OutputError, write_whole, writing
 
 if TYPE_CHECKING:
     from types import FrameType
@@ -171,6 +172,44 @@ def bound_rows(scene: Scene, bounds: Sequence[PaperBound | None], half_widths: N
 
 def _span(values: Sequence[float]) -> str:
     return f"{min(values):.3g} to {max(values):.3g}"
+
+
+def import_camera(
+    calibration: Annotated[Path, typer.Argument(help="Calibration file of OpenCV, ROS, Kalibr or Metavision: YAML, XML or JSON.")],
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Where to write the table; by default it is printed.")] = None,
+    camera: Annotated[str | None, typer.Option(help="Which camera of a Kalibr chain: cam0, cam1, ...")] = None,
+    model: Annotated[str | None, typer.Option(help="The lens, where the file does not say: radial-tangential or fisheye.")] = None,
+    size: Annotated[str | None, typer.Option(metavar="WIDTHxHEIGHT", help="The frame, where the file does not say.")] = None,
+) -> None:
+    """Turn a camera's calibration file into the table [camera] of a scene."""
+    try:
+        from build_model import import_camera as reader
+    except ImportError as error:
+        fail(f"import-camera: the package {error.name!r} is missing; pip install 'glideproof[build]'")
+    try:
+        sides = None if size is None else [int(side) for side in size.lower().split("x")]
+        if sides is not None and len(sides) != 2:
+            raise ValueError
+    except ValueError:
+        fail(f"--size {size}: give the frame's width and height, such as 640x480")
+    try:
+        found = reader.import_camera(calibration, reader.Wanted(camera, model, None if sides is None else (sides[0], sides[1])))
+    except reader.CalibrationFileError as error:
+        fail(error)
+    text = reader.camera_toml(found, calibration.name)
+    if output is None:
+        print(text, end="")
+        return
+    try:
+        with writing(output):
+            write_whole(output, text.encode())
+    except OutputError as error:
+        fail(error)
+
+
+def import_camera_command() -> None:
+    """Entry point of `import-camera`."""
+    terminal.run(import_camera)
 
 
 def export_model_command() -> None:

@@ -19,11 +19,11 @@ Columns = tuple[NDArray[np.int64], NDArray[np.int64]]
 def _scale_at_distance(camera: Camera, theta: Floats, d: Floats, start: Floats, stop: Floats) -> tuple[Floats, Floats]:
     """Range of g over rows with tangents [start, stop], (sets, rows) each, of ground d (sets, 2) ahead that is seen there.
 
-    F (cos(theta) - t sin(theta)) / d is affine in t, and falls in theta as long as psi >= 0; it is at most F sqrt(1 + t^2) / d.
+    F_u (cos(theta) - t sin(theta)) / d is affine in t, and falls in theta as long as psi >= 0; it is at most F_u sqrt(1 + t^2) / d.
     """
     low = np.minimum(*(np.maximum(reach(theta[:, 1:], tangent), 0) for tangent in (start, stop)))
     high = np.maximum(*(_farthest_reach(theta[:, :1], tangent) for tangent in (start, stop)))
-    return camera.focal_px * low / d[:, 1:], camera.focal_px * high / d[:, :1]
+    return camera.focal_u_px * low / d[:, 1:], camera.focal_u_px * high / d[:, :1]
 
 
 def _farthest_reach(theta: Floats, tangent: Floats) -> Floats:
@@ -60,6 +60,17 @@ def columns_that_may_be_lit(scene: Scene, sets: StateSet, beyond_px: int = 0) ->
         enclosures.append((np.where(absent, 0, first_touched(low)), np.where(absent, -1, last_touched(high))))
     firsts, lasts = zip(*enclosures, strict=True)
     return np.stack(firsts, axis=1), np.stack(lasts, axis=1)
+
+
+def rows_that_must_be_crossed(scene: Scene, sets: StateSet) -> NDArray[np.bool_]:
+    """True for the rows of the frame whose inside each marking meets in all states of a set, (sets, markings, rows)."""
+    camera, top = scene.camera, np.arange(scene.camera.height, dtype=np.float64)
+    crossed = []
+    for near, far in scene.runway.ends_z_m:
+        start = np.maximum(top, above(end_rows(camera, sets, far)[1])[:, None])
+        stop = np.minimum(top + 1, below(end_rows(camera, sets, near)[0])[:, None])
+        crossed.append(start < stop)
+    return np.stack(crossed, axis=1)
 
 
 def columns_that_must_be_lit(scene: Scene, sets: StateSet) -> Columns:

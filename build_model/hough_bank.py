@@ -21,43 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from build_model.enclosure import columns_that_may_be_lit, columns_that_must_be_lit
+from build_model.line_boxes import HALVING_ORDER, HALVINGS, MOST_WEAK, LineBoxes
 from build_model.pixel_mask import VerticalRuns, inset, paint, runs_of, widened
 from build_model.spatial_filter import reference_row, sliced, spatial_filter
 from build_model.window import Bits, Window
 from runtime.model.limits import SCALE_STEP, SMALLEST_LEVER_M
 from runtime.rounding import float32_above, float32_below, inverted
-from runtime.scene import STATE_NAMES, Camera, Scene, SceneError
+from runtime.scene import STATE_NAMES, Scene, SceneError
 from runtime.state_set import StateSet, contract, scale_range, tangent_of_row
-
-LINE_COORDINATES = ("theta", "x", "scale", "z")
-HALVINGS, HALVING_ORDER = 12, ("scale", "x", "theta", "z")
-"""How often an entry that would pass on any frame is halved, along which coordinates by turns, before the scene is refused."""
-MOST_WEAK = 4096
-"""More weak entries than this in a cell are not halved: the scene asks for more than a bank of sensible size can give."""
-
-
-@dataclass(frozen=True)
-class LineBoxes:
-    """Entries as boxes in line coordinates: `lower` and `upper` (entries, 4) hold theta, x, scale, z; `reference_row` (entries,) px.
-
-    An entry is the set of states of its cell inside its box.
-    """
-
-    lower: NDArray[np.float64]
-    upper: NDArray[np.float64]
-    reference_row: NDArray[np.float64]
-
-    def __len__(self) -> int:
-        return len(self.lower)
-
-    def __getitem__(self, chosen: NDArray[np.bool_]) -> LineBoxes:
-        return LineBoxes(self.lower[chosen], self.upper[chosen], self.reference_row[chosen])
-
-    def states(self, camera: Camera, cell_lower: NDArray[np.float64], cell_upper: NDArray[np.float64]) -> StateSet:
-        """The entries of the cell [cell_lower, cell_upper], (4,) each, as sets of states, not yet contracted."""
-        theta, x, scale, z = (np.stack([self.lower[:, axis], self.upper[:, axis]], axis=-1) for axis in range(4))
-        y = np.broadcast_to([cell_lower[2], cell_upper[2]], theta.shape)
-        return StateSet(theta, x, y, z, scale, tangent_of_row(camera, self.reference_row))
 
 
 @dataclass(frozen=True)
@@ -143,12 +114,12 @@ def cell_bank(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float6
         weak = parts[-1].weak(scene.tolerance.missed_budget)
         if not 0 < weak.sum() <= MOST_WEAK or parts[-1].hopeless(scene.tolerance.missed_budget):
             break
-        halves = _halved(parts[-1].lines[weak], HALVING_ORDER[halving % len(HALVING_ORDER)])
+        halves = parts[-1].lines[weak].halved(HALVING_ORDER[halving % len(HALVING_ORDER)])
         parts[-1:] = [parts[-1][~weak], _entries(scene, halves, lower, upper, spatial, window)]
     _demand_strong(scene, parts[-1])
     state_lower, state_upper = (np.concatenate([getattr(part.states, side) for part in parts]) for side in ("lower", "upper"))
     return CellBank(
-        lines=LineBoxes(*(np.concatenate([getattr(part.lines, name) for part in parts]) for name in ("lower", "upper", "reference_row"))),
+        lines=LineBoxes.joined([part.lines for part in parts]),
         spatial=runs_of(spatial[None], window),
         must_light=runs_of(np.concatenate([part.must_light for part in parts]), window),
         may_light=runs_of(np.concatenate([part.may_light for part in parts]), window),
@@ -169,17 +140,6 @@ def _entries(
     may_light = paint(widened(scene, columns_that_may_be_lit(scene, states, line_px), line_px), window) & spatial
     must_light = paint(inset(scene, columns_that_must_be_lit(scene, states), line_px), window)
     return _Entries(lines, states, must_light, may_light)
-
-
-def _halved(lines: LineBoxes, coordinate: str) -> LineBoxes:
-    """Each box as two halves along one line coordinate; along the scale where that coordinate is fixed."""
-    axis = LINE_COORDINATES.index(coordinate)
-    axes = np.where(lines.upper[:, axis] > lines.lower[:, axis], axis, LINE_COORDINATES.index("scale"))
-    each = np.arange(len(lines))
-    middle = (lines.lower[each, axes] + lines.upper[each, axes]) / 2
-    lower, upper = np.concatenate([lines.lower] * 2), np.concatenate([lines.upper] * 2)
-    upper[each, axes] = lower[len(lines) + each, axes] = middle
-    return LineBoxes(lower, upper, np.concatenate([lines.reference_row] * 2))
 
 
 def _demand_strong(scene: Scene, entries: _Entries) -> None:

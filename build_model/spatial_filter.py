@@ -37,7 +37,7 @@ def reference_row(camera: Camera, lower: NDArray[np.float64], upper: NDArray[np.
     """
     theta, _, y, z = (lower + upper) / 2
     row = float(row_of_point(camera, theta, y, z + middle_z_m))
-    horizon = camera.v0 - camera.focal_px * np.tan(lower[0])
+    horizon = camera.v0 - camera.focal_v_px * np.tan(lower[0])
     if row <= horizon:
         raise SceneError(f"bank.pitch_bins: too few for theta in [{lower[0]:.4g}, {upper[0]:.4g}]; give more, or narrower cells")
     return max(float(np.clip(np.round(row), 0, camera.height)), float(np.ceil(horizon)) + BELOW_HORIZON_PX)

@@ -139,7 +139,7 @@ def _likeliest_entries(estimator: Estimator, frame: NDArray) -> StateSet:
 def _states(scene: Scene, lines: Floats, tangents: Floats) -> Floats:
     """States (n, 4) of the domain, near those with the line coordinates theta, x, scale, z (n, 4); `runtime.state_set`."""
     theta, x, scale, z = lines.T
-    y = scene.camera.focal_px * fall(theta, tangents) / scale
+    y = scene.camera.focal_u_px * fall(theta, tangents) / scale
     return scene.domain.nearest(np.stack([theta, x, y, z], axis=-1))
 
 

@@ -41,35 +41,116 @@ MARGIN_PX = 2.0**-20
 ROUNDED_SHARE_OF_COLUMN, ROUNDED_SHARE_OF_DISTANCE = 2.0**-51, 2.0**-52
 """What float64 loses at most: on a column, of |u - u0| |v - v0| over the row's distance from the horizon, as the scale there is rounded
 (four units in the last place of 1); and on a distance, of the largest coordinate along the runway (two sums)."""
+DISTORTIONS = {"radial-tangential": (4, 5), "fisheye": (4,)}
+"""Models of a lens, and how many coefficients each has."""
+LARGEST_COEFFICIENT = 1e3
+"""Largest coefficient of a lens: far beyond any that is real, so that none overflows."""
 INSTANTS = {"start": 0.0, "middle": 0.5, "end": 1.0}
 """Instants of a window of events, and the share of it that lies before them."""
 
 
 @dataclass(frozen=True)
+class Distortion:
+    """A lens that is no pinhole: OpenCV's model of it, its coefficients in OpenCV's order."""
+
+    model: str
+    """"radial-tangential": k1, k2, p1, p2 and, where given, k3; or "fisheye": k1, k2, k3, k4."""
+    coefficients: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        _demand(self.model in DISTORTIONS, "camera.distortion.model", self.model, f"give one of {', '.join(DISTORTIONS)}")
+        counts = DISTORTIONS[self.model]
+        found, expected = list(self.coefficients), " or ".join(map(str, counts))
+        _demand(len(found) in counts, "camera.distortion.coefficients", found, f"{self.model} has {expected} of them")
+        usable = all(abs(value) <= LARGEST_COEFFICIENT for value in found)
+        _demand(usable, "camera.distortion.coefficients", found, f"stay within {LARGEST_COEFFICIENT:.0f}")
+
+    @property
+    def none(self) -> bool:
+        """True if it moves no point. A fisheye lens always does."""
+        return self.model == "radial-tangential" and not any(self.coefficients)
+
+
+@dataclass(frozen=True)
+class Mount:
+    """How the camera is turned in the aircraft: R_z(-roll) R_x(pitch down) R_y(-yaw), as the aircraft in turn is to the runway."""
+
+    roll_rad: float = 0.0
+    pitch_down_rad: float = 0.0
+    yaw_rad: float = 0.0
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            _demand(abs(value) < math.pi / 2, f"camera.mount.{field.name}", value, "stay within -pi/2 and pi/2")
+
+
+@dataclass(frozen=True)
 class Camera:
-    """Pinhole camera without distortion. `principal_point` is (u0, v0) in px, by default the frame's centre."""
+    """A camera: a pinhole, and a lens that distorts what it shows where `distortion` is given.
+
+    The focal lengths are `focal_px` = (F_u, F_v), or one quotient of two lengths. `principal_point` is (u0, v0) in px, by default the
+    frame's centre; pixel corners are at integers (`runtime.camera`).
+    """
 
     width: int
     height: int
-    focal_length_m: float
-    pixel_pitch_m: float
+    focal_length_m: float | None = None
+    pixel_pitch_m: float | None = None
     principal_point: tuple[float, float] | None = None
+    focal_px: tuple[float, float] | None = None
+    distortion: Distortion | None = None
+    mount: Mount | None = None
 
     def __post_init__(self) -> None:
         for name in ("width", "height"):
             _demand(1 <= getattr(self, name) <= 16384, f"camera.{name}", getattr(self, name), "give 1 to 16384 pixels")
-        for name in ("focal_length_m", "pixel_pitch_m"):
-            _demand(getattr(self, name) > 0, f"camera.{name}", getattr(self, name), "give a length above 0")
-        low, high = FOCAL_RANGE_PX
-        ratio = "focal_length_m / pixel_pitch_m"
-        _demand(low <= self.focal_px <= high, f"camera.{ratio}", self.focal_px, f"give a ratio of {low:.0f} to {high:.0f} px")
+        self._check_focal_lengths()
         reachable = all(abs(centre) <= LARGEST_PRINCIPAL_POINT_PX for centre in (self.u0, self.v0))
         _demand(reachable, "camera.principal_point", self.principal_point, f"stay within {LARGEST_PRINCIPAL_POINT_PX:.0f} px of the corner")
 
+    def _check_focal_lengths(self) -> None:
+        low, high = FOCAL_RANGE_PX
+        lengths = {"focal_length_m": self.focal_length_m, "pixel_pitch_m": self.pixel_pitch_m}
+        if self.focal_px is not None:
+            given = [name for name, length in lengths.items() if length is not None]
+            _demand(not given, f"camera.{' and '.join(given)}", "given beside focal_px", "give either focal_px or the two lengths")
+            _demand(
+                all(low <= focal <= high for focal in self.focal_px),
+                "camera.focal_px",
+                list(self.focal_px),
+                f"give {low:.0f} to {high:.0f} px",
+            )
+            return
+        for name, length in lengths.items():
+            _demand(length is not None, f"camera.{name}", "nothing", "this key is required, or focal_px = [fx, fy]")
+            _demand(length is not None and length > 0, f"camera.{name}", length, "give a length above 0")
+        ratio = "focal_length_m / pixel_pitch_m"
+        _demand(low <= self.focal_u_px <= high, f"camera.{ratio}", self.focal_u_px, f"give a ratio of {low:.0f} to {high:.0f} px")
+
+    @cached_property
+    def focal_u_px(self) -> float:
+        """F_u: px that a point moves to the right per unit of X/Z."""
+        return self._focal_px[0]
+
+    @cached_property
+    def focal_v_px(self) -> float:
+        """F_v: px that a point moves down per unit of -Y/Z."""
+        return self._focal_px[1]
+
     @property
-    def focal_px(self) -> float:
-        """F = rho f, the focal length in px."""
-        return self.focal_length_m / self.pixel_pitch_m
+    def _focal_px(self) -> tuple[float, float]:
+        if self.focal_px is not None:
+            return self.focal_px
+        if self.focal_length_m is None or self.pixel_pitch_m is None:
+            raise SceneError("camera.focal_px: found nothing; give focal_px, or focal_length_m and pixel_pitch_m")
+        focal = self.focal_length_m / self.pixel_pitch_m
+        return focal, focal
+
+    @property
+    def pinhole(self) -> bool:
+        """True if the frame is the ideal one: no distortion, and no turn in the aircraft."""
+        return (self.distortion is None or self.distortion.none) and (self.mount is None or self.mount == Mount())
 
     @property
     def u0(self) -> float:
@@ -183,6 +264,23 @@ class Bank:
 
 
 @dataclass(frozen=True)
+class WindowedBank:
+    """A bank for a whole approach: entries that move the image by tens of px, tested by must-hit windows (`build_model.window_bank`)."""
+
+    set_px: float = 20.0
+    """How far, in px, the states of an entry move the image at most along each of its axes, about; less where the runway has few rows."""
+    rows: int = 16
+    """Rows of pixels in which an entry has windows, at most."""
+    places: int = 128
+    """Groups of entries that a frame opens, at most; what passes beyond these stays whole."""
+
+    def __post_init__(self) -> None:
+        _demand(0.5 <= self.set_px <= 1000, "bank.set_px", self.set_px, "give 0.5 to 1000 px")
+        for name, most in (("rows", 1000), ("places", 10_000)):
+            _demand(1 <= getattr(self, name) <= most, f"bank.{name}", getattr(self, name), f"give a count of 1 to {most}")
+
+
+@dataclass(frozen=True)
 class Tolerance:
     """What a frame may lack or add: see the assumptions of Theorems A and B in `docs/guarantee.md`."""
 
@@ -253,7 +351,7 @@ class Scene:
     camera: Camera
     runway: Runway
     domain: Domain
-    bank: Bank
+    bank: Bank | WindowedBank
     calibration: Calibration = Calibration()
     tolerance: Tolerance = Tolerance()
     estimator: EstimatorTraining = EstimatorTraining()
@@ -268,25 +366,33 @@ class Scene:
         widest = math.pi / 2 - SMALLEST_ANGLE_AHEAD_RAD
         ahead = -widest <= flattest and steepest <= widest
         _demand(ahead, "domain", "a state with the runway behind the camera (Z <= 0)", "narrow theta_rad, y_m or z_m")
+        self._check_lens()
         self._check_margin(nearest, farthest)
+
+    def _check_lens(self) -> None:
+        advice = "only 0 is taken so far"
+        _demand(self.camera.mount in (None, Mount()), "camera.mount", "a camera that is turned in the aircraft", advice)
+        none = self.camera.distortion is None or self.camera.distortion.none
+        _demand(none, "camera.distortion", "a lens that is no pinhole", advice)
 
     def _check_margin(self, nearest: float, farthest: float) -> None:
         """The margin of `runtime.rounding` is twice float64's error on rows and columns in view, or more. Raises `SceneError`.
 
-        An end is F y / (Z cos(theta)) px below the horizon. A point in view, r away from the camera, moves by no more than
-        ((u - u0)^2 + (v - v0)^2 + F^2) / (F r) px a metre along the runway.
+        An end is F_v y / (Z cos(theta)) px below the horizon. A point in view, r away from the camera, moves by no more than
+        F (1 + ((u - u0)/F_u)^2 + ((v - v0)/F_v)^2) / r px a metre along the runway, F the larger of F_u and F_v.
         """
         camera, (low, high) = self.camera, (self.domain.lower, self.domain.upper)
+        focal_u, focal_v = camera.focal_u_px, camera.focal_v_px
         across, down = (
             max(abs(centre), abs(side - centre)) + LARGEST_LINE_PX
             for side, centre in ((camera.width, camera.u0), (camera.height, camera.v0))
         )
-        below_horizon_px = camera.focal_px * low[2] / math.hypot(high[2], farthest)
+        below_horizon_px = focal_v * low[2] / math.hypot(high[2], farthest)
         lost = ROUNDED_SHARE_OF_COLUMN * across * down / below_horizon_px
         advice = "raise y_m, or end the runway or the domain nearer"
         _demand(lost <= MARGIN_PX / 2, "domain", f"an end {below_horizon_px:.3g} px below the horizon, too near to round safely", advice)
         largest = max(np.abs(self.runway.ends_z_m).max(), np.abs([low[3], high[3]]).max())
-        px_per_m = (camera.focal_px**2 + across**2 + down**2) / camera.focal_px / math.hypot(low[2], nearest)
+        px_per_m = max(focal_u, focal_v) * (1 + (across / focal_u) ** 2 + (down / focal_v) ** 2) / math.hypot(low[2], nearest)
         found = f"coordinates along the runway of up to {largest:.3g} m where a metre spans up to {px_per_m:.3g} px"
         lost = ROUNDED_SHARE_OF_DISTANCE * largest * px_per_m
         _demand(lost <= MARGIN_PX / 2, "domain.z_m", found, "put the origin near the threshold, so that they round safely")

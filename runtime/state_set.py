@@ -4,12 +4,12 @@ A `StateSet` holds all states with theta, x, y and z in given intervals whose *s
 a reference row (`runtime.camera`), lies in an interval too. Pitch and altitude compensate each other in an image; the scale is
 what the image fixes, and a box in (theta, x, scale, z) bounds the lines of all markings at once.
 
-Rows enter as tangents t = (v - v0)/F = tan(phi), phi the angle below the camera's axis; psi = theta + phi is that below the horizon,
+Rows enter as tangents t = (v - v0)/F_v = tan(phi), phi the angle below the camera's axis; psi = theta + phi is that below the horizon,
 and s(theta, t) = sin(psi)/cos(phi) = t cos(theta) + sin(theta). Then
 
-    g(v) = F s(theta, t) / y                          so y = F s(theta, t_ref) / scale
+    g(v) = F_u s(theta, t) / y                        so y = F_u s(theta, t_ref) / scale
     g(v) = scale R,  R = s(theta, t) / s(theta, t_ref);   dR/dtheta has the sign of t_ref - t
-    a ground point d ahead, seen at row v:  y = d tan(psi),  g(v) = F (cos(theta) - t sin(theta)) / d,  0 < psi < pi/2
+    a ground point d ahead, seen at row v:  y = d tan(psi),  g(v) = F_u (cos(theta) - t sin(theta)) / d,  0 < psi < pi/2
 
 Every monotonicity that is used is one of these, or is checked over the set where it depends on it (`end_rows`). Results are
 plain float64 bounds, which `runtime.rounding` turns outward where they are used; `contract` alone does so itself.
@@ -125,8 +125,8 @@ class StateSet:
 
 
 def tangent_of_row(camera: Camera, v: ArrayLike) -> Floats:
-    """t = (v - v0)/F of a row."""
-    return (np.asarray(v, dtype=np.float64) - camera.v0) / camera.focal_px
+    """t = (v - v0)/F_v of a row."""
+    return (np.asarray(v, dtype=np.float64) - camera.v0) / camera.focal_v_px
 
 
 def fall(theta: Floats, tangent: Floats) -> Floats:
@@ -149,14 +149,14 @@ def fall_range(theta: Floats, tangent: Floats) -> tuple[Floats, Floats]:
 def scale_range(camera: Camera, theta: Floats, y: Floats, tangent: Floats) -> tuple[Floats, Floats]:
     """Exact range of g over boxes theta (..., 2) x y (..., 2), at rows below the horizon."""
     low, high = fall_range(theta, tangent)
-    return camera.focal_px * low / y[..., 1], camera.focal_px * high / y[..., 0]
+    return camera.focal_u_px * low / y[..., 1], camera.focal_u_px * high / y[..., 0]
 
 
 def contract(camera: Camera, sets: StateSet) -> StateSet:
-    """The same sets with the intervals of theta and y contracted by y = F s(theta, t_ref) / scale, rounded outward."""
+    """The same sets with the intervals of theta and y contracted by y = F_u s(theta, t_ref) / scale, rounded outward."""
     tangent = sets.tangent
     phi, secant = np.arctan(tangent), np.sqrt(1 + tangent**2)
-    sine_low, sine_high = (sets.scale[:, side] * sets.y[:, side] / (camera.focal_px * secant) for side in (0, 1))
+    sine_low, sine_high = (sets.scale[:, side] * sets.y[:, side] / (camera.focal_u_px * secant) for side in (0, 1))
     psi_low = np.arcsin(np.clip(lowered(sine_low, sine_low), 0, 1))  # near 1 an arcsine makes much of its argument's rounding
     psi_high = np.arcsin(np.clip(raised(sine_high, sine_high), 0, 1))
     theta_low = np.maximum(sets.theta[:, 0], lowered(psi_low - phi, psi_low + np.abs(phi)))
@@ -169,13 +169,13 @@ def contract(camera: Camera, sets: StateSet) -> StateSet:
 
 
 def altitude_range(camera: Camera, sets: StateSet) -> tuple[Floats, Floats]:
-    """Range of y = F s(theta, t_ref) / scale over theta and scale alone, (sets,) each."""
+    """Range of y = F_u s(theta, t_ref) / scale over theta and scale alone, (sets,) each."""
     low, high = sets.reference_range
-    return camera.focal_px * low / sets.scale[:, 1], camera.focal_px * high / sets.scale[:, 0]
+    return camera.focal_u_px * low / sets.scale[:, 1], camera.focal_u_px * high / sets.scale[:, 0]
 
 
 def end_rows(camera: Camera, sets: StateSet, end_z_m: ArrayLike) -> tuple[Floats, Floats]:
-    """Range of the row of a marking's end, px: v0 + F tan(beta - theta), beta = atan2(y, end_z_m + z).
+    """Range of the row of a marking's end, px: v0 + F_v tan(beta - theta), beta = atan2(y, end_z_m + z).
 
     `end_z_m`: a number, or several (ends,); returns (sets,) or (sets, ends) each. Over the box (theta, y, z) the row falls in theta and
     z and rises in y. At one scale y follows theta, and d(beta - theta)/dtheta = sin(beta) cos(beta) cot(psi_ref) - 1: where that is
@@ -186,7 +186,7 @@ def end_rows(camera: Camera, sets: StateSet, end_z_m: ArrayLike) -> tuple[Floats
     near, far = sets.z[:, 0] + end, sets.z[:, 1] + end
     lowest, highest = sets.y.T
     (cosine, other_cosine), (sine, other_sine) = sets.turn[0].T, sets.turn[1].T
-    y_flat, y_steep = (camera.focal_px * sets.reference_fall / sets.scale).T
+    y_flat, y_steep = (camera.focal_u_px * sets.reference_fall / sets.scale).T
     slope = np.minimum(np.maximum(highest, altitude_range(camera, sets)[1]) / near, 1.0)
     # sin(beta) cos(beta) = slope / (1 + slope^2), which rises up to slope 1
     cotangent = (cosine - sine * sets.tangent) / sets.reference_fall[:, 0]
@@ -200,7 +200,7 @@ def end_rows(camera: Camera, sets: StateSet, end_z_m: ArrayLike) -> tuple[Floats
 
 def _row(camera: Camera, cosine: Floats, sine: Floats, y: Floats, d: Floats) -> Floats:
     """`row_of_point` at the pitch with this cosine and sine."""
-    return camera.v0 + camera.focal_px * (y * cosine - d * sine) / (y * sine + d * cosine)
+    return camera.v0 + camera.focal_v_px * (y * cosine - d * sine) / (y * sine + d * cosine)
 
 
 def scale_ratio(sets: StateSet, tangent: Floats) -> tuple[Floats, Floats]:

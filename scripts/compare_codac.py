@@ -186,7 +186,7 @@ class SetInversion:
         if scene.domain.lower[1] != scene.domain.upper[1] or scene.tolerance.line_px or scene.tolerance.missed_budget:
             raise ValueError("scene: found a free x axis or a tolerance; this comparison needs x fixed, line_px 0 and missed_budget 0")
         self._scene = scene
-        self._focal = codac.Interval(scene.camera.focal_px)
+        self._focal_u, self._focal_v = codac.Interval(scene.camera.focal_u_px), codac.Interval(scene.camera.focal_v_px)
         self._variables = codac.VectorVar(len(UNKNOWNS))
         self._functions: dict[int, VectorFunction] = {}
         across, ends = scene.runway.x_m - scene.domain.lower[1], scene.runway.ends_z_m
@@ -223,7 +223,7 @@ class SetInversion:
         theta, y, z = (self._variables[axis] for axis in range(len(UNKNOWNS)))
         components = []
         for distance in (z + float(end) for end in ends_z_m):
-            components.append(self._scene.camera.v0 + self._focal * codac.tan(codac.atan2(y, distance) - theta))
+            components.append(self._scene.camera.v0 + self._focal_v * codac.tan(codac.atan2(y, distance) - theta))
             components.append(y * codac.sin(theta) + distance * codac.cos(theta))
         return codac.AnalyticFunction([self._variables], codac.vec(*components))
 
@@ -233,8 +233,8 @@ class SetInversion:
             theta, y = self._variables[0], self._variables[1]
             components = []
             for border in range(block * BLOCK, (block + 1) * BLOCK):
-                tangent = (codac.Interval(border) - self._scene.camera.v0) / self._focal
-                components.append(self._focal * codac.sqrt(1.0 + codac.sqr(tangent)) * codac.sin(theta + codac.atan(tangent)) / y)
+                tangent = (codac.Interval(border) - self._scene.camera.v0) / self._focal_v
+                components.append(self._focal_u * codac.sqrt(1.0 + codac.sqr(tangent)) * codac.sin(theta + codac.atan(tangent)) / y)
             self._functions[block] = codac.AnalyticFunction([self._variables], codac.vec(*components))
         return self._functions[block]
 
@@ -275,7 +275,7 @@ class SetInversion:
         """False if some marking has an end that falls on dark pixels alone; `low`, `high`: bounds of the ends' components."""
         camera = self._scene.camera
         for row, depth in ((NEAR_ROW, NEAR_DEPTH), (FAR_ROW, FAR_DEPTH)):
-            columns = np.sort(camera.u0 + camera.focal_px * np.outer(across, [1 / low[depth], 1 / high[depth]]), axis=1)
+            columns = np.sort(camera.u0 + camera.focal_u_px * np.outer(across, [1 / low[depth], 1 / high[depth]]), axis=1)
             rows = below(low[row]), above(high[row])
             if not all(lit.any_within(rows, (below(left), above(right))) for left, right in columns):
                 return False

@@ -214,7 +214,7 @@ class Baseline:
         return Measured(u, v, across, near_row=run[-1], far_row=run[0], line=self._fitted(u, v, across))
 
     def _tangent(self, v: Floats | float) -> Floats:
-        return (np.asarray(v) - self._scene.camera.v0) / self._scene.camera.focal_px
+        return (np.asarray(v) - self._scene.camera.v0) / self._scene.camera.focal_v_px
 
     def _fitted(self, u: Floats, v: Floats, across: Floats) -> Floats:
         """(a, b) of u - u0 = (p_x - x)(a t + b) by linear least squares."""
@@ -225,10 +225,10 @@ class Baseline:
         return self._by_solve_pnp(measured) if solver == "solvePnP" else self._by_least_squares(measured)
 
     def _by_lines(self, measured: Measured) -> Floats:
-        """Pose (theta, y, z) of the fitted lines and the ends: tan(theta) = b/a, y = F cos(theta)/a, z the mean of what the ends give."""
+        """Pose (theta, y, z) of the fitted lines and the ends: tan(theta) = b/a, y = F_u cos(theta)/a, z the mean of what the ends give."""
         slope, scale = measured.line
         theta = np.arctan2(scale, slope)
-        y = self._scene.camera.focal_px * np.cos(theta) / slope
+        y = self._scene.camera.focal_u_px * np.cos(theta) / slope
         beta = theta + np.arctan(self._tangent(np.array([measured.near_row, measured.far_row])))
         return np.array([theta, y, (y / np.tan(beta) - [self._near_z, self._far_z]).mean()])
 
@@ -261,7 +261,7 @@ class Baseline:
             for p_z, row in ((self._near_z, measured.near_row), (self._far_z, measured.far_row)):
                 scene_points.append((p_x, p_z, 0.0))  # right, ahead, up
                 image_points.append((camera.u0 + across * (self._tangent(row) * measured.line[0] + measured.line[1]), row))
-        matrix = np.array([[camera.focal_px, 0, camera.u0], [0, camera.focal_px, camera.v0], [0, 0, 1]])
+        matrix = np.array([[camera.focal_u_px, 0, camera.u0], [0, camera.focal_v_px, camera.v0], [0, 0, 1]])
         points = np.array(scene_points), np.array(image_points)
         _, turn, shift = cv2.solvePnP(*points, matrix, None, flags=cv2.SOLVEPNP_ITERATIVE)
         rotation = cv2.Rodrigues(turn)[0]

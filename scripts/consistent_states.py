@@ -101,11 +101,11 @@ class LineCoordinates:
         """The states, (n, 4), within the domain's axes of width 0; NaN or nonsense where there is none in front of the camera."""
         far, near, track, row = coordinates.T
         camera, domain = self.scene.camera, self.scene.domain
-        start, stop = ((at - camera.v0) / camera.focal_px for at in self.rows)
+        start, stop = ((at - camera.v0) / camera.focal_v_px for at in self.rows)
         slope = (near - far) / (stop - start)
         theta = np.arctan2(far - slope * start, slope)
-        y = camera.focal_px * np.cos(theta) / slope
-        tangent = (row - camera.v0) / camera.focal_px
+        y = camera.focal_u_px * np.cos(theta) / slope
+        tangent = (row - camera.v0) / camera.focal_v_px
         d = y * (np.cos(theta) - tangent * np.sin(theta)) / (tangent * np.cos(theta) + np.sin(theta))
         states = np.stack([theta, track / far, y, d - self.end_z_m], axis=-1)
         return np.where(domain.lower == domain.upper, domain.lower, states)

@@ -97,7 +97,7 @@ def smallest_must_light(scene: Scene, tolerance: Tolerance) -> int | None:
 def vibration_shift_px(scene: Scene) -> float:
     """Largest shift of a marking under the vibration, as the build bounds that of a calibration."""
     window: Window = functools.reduce(Window.union, (bank.window for bank in build_banks(scene)))
-    return displacement_px(replace(scene, calibration=Vibration().calibration(scene.camera.focal_px)), window)
+    return displacement_px(replace(scene, calibration=Vibration().calibration(scene.camera.focal_v_px)), window)
 
 
 def bearable(scene: Scene, budgets: Sequence[int]) -> Iterator[tuple[Tolerance, int | None]]:

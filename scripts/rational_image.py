@@ -4,7 +4,7 @@ Where tan(theta/2) is rational, so are cos(theta) = (1 - t^2)/(1 + t^2) and sin(
 end of a marking is projected without any rounding:
 
     X = p_x - x        down = y cos(theta) - d sin(theta)        Z = y sin(theta) + d cos(theta),        d = p_z + z
-    u = u0 + F X/Z     v = v0 + F down/Z
+    u = u0 + F_u X/Z     v = v0 + F_v down/Z
 
 A camera that is off is turned by rational half-angle tangents too: first yawed, then rolled. A pixel is lit if a point of a closed
 segment lies in it; pixels are half-open, so that a point on the border of two belongs to the right or the lower one. Nothing here is
@@ -123,13 +123,22 @@ class RunwayImage:
         return thick
 
 
+def _focal_lengths(camera: dict[str, Any]) -> tuple[Fraction, Fraction]:
+    """F_u and F_v of a scene's table `camera`, px."""
+    if "focal_px" in camera:
+        return Fraction(camera["focal_px"][0]), Fraction(camera["focal_px"][1])
+    focal = Fraction(camera["focal_length_m"]) / Fraction(camera["pixel_pitch_m"])
+    return focal, focal
+
+
 @dataclass(frozen=True)
 class RationalView:
     """A camera and what it looks at. `roll` and `yaw` are the tangents of half the angles by which the camera is off."""
 
     width: int
     height: int
-    focal: Fraction
+    focal_u: Fraction
+    focal_v: Fraction
     u0: Fraction
     v0: Fraction
     stripes: tuple[Stripe, ...]
@@ -145,8 +154,8 @@ class RationalView:
         for marking in tables["runway"]["markings"]:
             start = Fraction(marking["start_z_m"])
             stripes.append(Stripe(Fraction(marking["x_m"]), start, start + Fraction(marking["length_m"])))
-        focal = Fraction(camera["focal_length_m"]) / Fraction(camera["pixel_pitch_m"])
-        return RationalView(camera["width"], camera["height"], focal, Fraction(u0), Fraction(v0), tuple(stripes))
+        focal = _focal_lengths(camera)
+        return RationalView(camera["width"], camera["height"], *focal, Fraction(u0), Fraction(v0), tuple(stripes))
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -158,7 +167,7 @@ class RationalView:
         right, down, depth = self._turned(state, p_x, p_z)
         if depth <= 0:
             raise ValueError("the point lies behind the camera")
-        return self.u0 + self.focal * right / depth, self.v0 + self.focal * down / depth
+        return self.u0 + self.focal_u * right / depth, self.v0 + self.focal_v * down / depth
 
     def _turned(self, state: RationalState, p_x: Fraction, p_z: Fraction) -> tuple[Fraction, Fraction, Fraction]:
         """The ground point in the camera's frame: to the right, down and ahead, m."""

@@ -81,17 +81,17 @@ class CellRow:
 def hough_ranges(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> NDArray[np.float64]:
     """Enclosure of rho = u cos(phi) + v sin(phi) of every marking's line over the box [lower, upper], (4,) each: (markings, 4).
 
-    The line is u = m v + c with m = a cos(theta) / y, c = u0 + a (F sin(theta) - v0 cos(theta)) / y, a = p_x - x: hence tan(phi) = -m and
-    rho = c cos(phi). m, c and cos(phi) are monotone in each variable where sin and cos are; the box is divided until the products of
-    their ranges are tight. Returned: rho's ends (px), phi's ends (degrees).
+    The line is u = m v + c with m = a cos(theta) / y, c = u0 + a (F_v sin(theta) - v0 cos(theta)) / y, a = (p_x - x) F_u/F_v: hence
+    tan(phi) = -m and rho = c cos(phi). m, c and cos(phi) are monotone in each variable where sin and cos are; the box is divided until
+    the products of their ranges are tight. Returned: rho's ends (px), phi's ends (degrees).
     """
     axes = [np.linspace(low, high, SUBDIVISIONS + 1) for low, high in zip(lower, upper, strict=True)]
     corners = np.stack(np.meshgrid(axes[0], axes[1], axes[2], indexing="ij"))
     camera, ranges = scene.camera, []
     for x_m in scene.runway.x_m:
-        theta, across, y = corners[0], x_m - corners[1], corners[2]
+        theta, across, y = corners[0], (x_m - corners[1]) * (camera.focal_u_px / camera.focal_v_px), corners[2]
         slope = across * np.cos(theta) / y
-        offset = camera.u0 + across * (camera.focal_px * np.sin(theta) - camera.v0 * np.cos(theta)) / y
+        offset = camera.u0 + across * (camera.focal_v_px * np.sin(theta) - camera.v0 * np.cos(theta)) / y
         low_c, high_c = _over_boxes(offset)
         low_m, high_m = _over_boxes(slope)
         straight = np.where(low_m * high_m < 0, 0, np.minimum(np.abs(low_m), np.abs(high_m)))

@@ -175,7 +175,7 @@ class Flight:
         camera = self.scene.camera
         theta, x, y, z = self.states(time_us).T
         yaw, roll, pitch = self.vibration.angles(time_us, self._phases_rad).T
-        to_rays = np.array([[1, 0, -camera.u0], [0, 1, -camera.v0], [0, 0, camera.focal_px]]) / camera.focal_px
+        to_rays = np.array([[1, 0, -camera.u0], [0, 1, -camera.v0], [0, 0, 1]]) / [[camera.focal_u_px], [camera.focal_v_px], [1]]
         rays = _turned(1, -yaw) @ _turned(2, -roll) @ to_rays
         cosine, sine = np.cos(theta + pitch)[:, None], np.sin(theta + pitch)[:, None]
         fall = cosine * rays[:, 1] + sine * rays[:, 2]
@@ -215,9 +215,10 @@ class Ground:
         x_w, z_w, fall = (maps[:, row, 0] * columns + maps[:, row, 1] * rows + maps[:, row, 2] for row in range(3))
         fall = np.maximum(fall, self._flattest_fall)
         x_m, z_m = x_w / fall, z_w / fall
-        # Footprint of a pixel: p_x moves by y / (F w) for a column, p_z by y / (F w^2) for a row.
-        across = (views.altitude_m / self.scene.camera.focal_px).astype(np.float32)[:, None] / fall
-        along = across / fall
+        # Footprint of a pixel: p_x moves by y / (F_u w) for a column, p_z by y / (F_v w^2) for a row.
+        camera = self.scene.camera
+        across, down = ((views.altitude_m / focal).astype(np.float32)[:, None] / fall for focal in (camera.focal_u_px, camera.focal_v_px))
+        along = down / fall
         mean = np.float32(self.target.ground_reflectance)
         ground = mean + (self._sampled(x_m, z_m) - mean) * np.minimum(np.float32(TEXTURE_GRAIN_M) / along, 1)
         covered = np.zeros_like(ground)

@@ -56,6 +56,8 @@ FREE_X = replace(
 """81 cells, three of them along x."""
 ONE_CELL = replace(PAPER, domain=Domain(Axis((0.6,), 0.1), Axis((0.1,), 0.0), Axis((0.9,), 0.1), Axis((1.7,), 0.1)))
 """Quick to build; its x is fixed at 0.1, which float32 cannot hold."""
+OBLONG = replace(ONE_CELL, camera=Camera(width=640, height=480, focal_px=(560.0, 520.0), principal_point=(331.5, 236.25)))
+"""Pixels that are not square, the principal point off the centre."""
 BARELY_ABOVE = seen_from(replace(ONE_CELL, runway=Runway((Marking("L", -0.1, 0.0, 0.3), Marking("R", 0.1, 0.2, 0.3)))), 320.0, 110.0)
 BARELY_BELOW = seen_from(replace(ONE_CELL, runway=Runway((Marking("L", -0.1, 0.0, 0.3), Marking("R", 0.1, 0.0, 0.1)))), 320.0, 520.0)
 """In some states the right marking lies just above, or just below, the frame: a camera that is off brings it into view."""
@@ -101,6 +103,7 @@ SCENES = {
     "cut below": CUT_BELOW,
     "free x": FREE_X,
     "one cell": ONE_CELL,
+    "oblong pixels": OBLONG,
     "tolerant": tolerant(PAPER, OFF_BY),
     "tolerant, cut left": tolerant(CUT_LEFT, SHIFTED),
     "tolerant, cut right": tolerant(CUT_RIGHT, SHIFTED),
@@ -153,7 +156,7 @@ def states_in(scene: Scene, sets: StateSet, count: int, seed: int) -> Floats:
     share[: count // 2] = np.round(share[: count // 2])  # half of them on corners
     # a + (b - a) may exceed b by its last bit: such a state would be no state of the set
     theta, x, scale, z = np.minimum(sides[:, 0] + share * (sides[:, 1] - sides[:, 0]), sides[:, 1]).T
-    row = scene.camera.v0 + scene.camera.focal_px * sets.tangent[0]
+    row = scene.camera.v0 + scene.camera.focal_v_px * sets.tangent[0]
     y = ground_scale(scene.camera, theta, 1.0, row) / scale
     keep = (y >= sets.y[0, 0]) & (y <= sets.y[0, 1])
     corners = np.stack([rng.choice(sets.theta[0], count), rng.choice(sets.y[0], count)])

@@ -33,10 +33,10 @@ def seen(points: Floats, off: Calibration, signs: tuple[float, ...], roll_first:
     """Points (n, 2) px of an ideal camera as one sees them that is turned, zoomed and shifted by shares `signs` of `off`."""
     camera = PAPER.camera
     centre = np.array([camera.u0, camera.v0])
-    rays = np.concatenate([(points - centre) / camera.focal_px, np.ones((len(points), 1))], axis=1)
+    rays = np.concatenate([(points - centre) / camera.focal_v_px, np.ones((len(points), 1))], axis=1)
     yaw, roll = rotation(1, signs[0] * off.yaw_rad), rotation(2, signs[1] * off.roll_rad)
     turned = rays @ (yaw @ roll if roll_first else roll @ yaw).T
-    zoom = camera.focal_px * (1 + signs[2] * off.focal_relative)
+    zoom = camera.focal_v_px * (1 + signs[2] * off.focal_relative)
     return centre + np.array(signs[3:]) * off.principal_px + zoom * turned[:, :2] / turned[:, 2:]
 
 

@@ -38,6 +38,8 @@ GENERAL = Scene(
     bank=Bank(1, 1, 1.0),
 )
 """Everything that the paper's scene has not: x free, an off-centre principal point, pitch up and down, markings unlike each other."""
+OBLONG = dataclasses.replace(GENERAL, camera=Camera(1280, 720, principal_point=(611.25, 402.5), focal_px=(2100.0, 1980.0)))
+"""The same with pixels that are not square."""
 
 
 # --- the projection ---
@@ -49,15 +51,15 @@ def opencv_ends(scene: Scene, state: Floats) -> Floats:
     rotation, _ = cv2.Rodrigues(np.array([theta, 0.0, 0.0]))
     translation = -rotation @ np.array([x, -y, -z])
     camera = scene.camera
-    intrinsic = np.array([[camera.focal_px, 0, camera.u0], [0, camera.focal_px, camera.v0], [0, 0, 1]])
+    intrinsic = np.array([[camera.focal_u_px, 0, camera.u0], [0, camera.focal_v_px, camera.v0], [0, 0, 1]])
     points = np.array([[marking.x_m, 0.0, end] for marking in scene.runway.markings for end in marking.ends_z_m])
     pixels, _ = cv2.projectPoints(points, np.array([theta, 0.0, 0.0]), translation, intrinsic, np.zeros(4))
     return np.asarray(pixels, dtype=np.float64).reshape(-1, 2, 2)
 
 
-@pytest.mark.parametrize("name", ["paper", "general"])
+@pytest.mark.parametrize("name", ["paper", "general", "oblong"])
 def test_the_projection_is_opencvs(name: str, paper_scene: Scene, random_states: RandomStates) -> None:
-    scene = paper_scene if name == "paper" else GENERAL
+    scene = {"paper": paper_scene, "general": GENERAL, "oblong": OBLONG}[name]
     states = random_states(scene, 200, 11)
     expected = np.array([opencv_ends(scene, state) for state in states])
     assert np.abs(project(scene, states) - expected).max() < ROUNDING_PX
@@ -82,29 +84,34 @@ def test_ends_are_near_then_far(paper_scene: Scene) -> None:
 # --- the closed forms ---
 
 
-def test_the_row_of_an_end_has_a_closed_form(random_states: RandomStates) -> None:
-    states = random_states(GENERAL, 200, 13)
+PIXELS = pytest.mark.parametrize("scene", [GENERAL, OBLONG], ids=["square", "oblong"])
+
+
+@PIXELS
+def test_the_row_of_an_end_has_a_closed_form(scene: Scene, random_states: RandomStates) -> None:
+    states = random_states(scene, 200, 13)
     theta, _, y, z = states.T[:, :, None, None]
-    rows = row_of_point(GENERAL.camera, theta, y, GENERAL.runway.ends_z_m + z)
-    assert np.abs(rows - project(GENERAL, states)[..., 1]).max() < ROUNDING_PX
+    rows = row_of_point(scene.camera, theta, y, scene.runway.ends_z_m + z)
+    assert np.abs(rows - project(scene, states)[..., 1]).max() < ROUNDING_PX
 
 
-def test_all_points_of_a_marking_lie_on_a_line_that_z_does_not_move(random_states: RandomStates) -> None:
+@PIXELS
+def test_all_points_of_a_marking_lie_on_a_line_that_z_does_not_move(scene: Scene, random_states: RandomStates) -> None:
     """u = u0 + (p_x - x) g(v) at 11 points of each marking, with g from the state's theta and y alone."""
-    states = random_states(GENERAL, 200, 14)
+    states = random_states(scene, 200, 14)
     theta, x, y, _ = states.T[:, :, None, None]
-    runway = GENERAL.runway
+    runway = scene.runway
     along = np.linspace(runway.ends_z_m[:, 0], runway.ends_z_m[:, 1], 11, axis=-1)
-    points = project_points(GENERAL.camera, states[:, None, None, :], runway.x_m[:, None], along)
-    scale = ground_scale(GENERAL.camera, theta, y, points[..., 1])
-    assert np.abs(GENERAL.camera.u0 + (runway.x_m[:, None] - x) * scale - points[..., 0]).max() < ROUNDING_PX
+    points = project_points(scene.camera, states[:, None, None, :], runway.x_m[:, None], along)
+    scale = ground_scale(scene.camera, theta, y, points[..., 1])
+    assert np.abs(scene.camera.u0 + (runway.x_m[:, None] - x) * scale - points[..., 0]).max() < ROUNDING_PX
 
 
 def test_the_ground_vanishes_at_one_row(random_states: RandomStates) -> None:
     camera = GENERAL.camera
     for state in random_states(GENERAL, 50, 15):
         theta, _, y, _ = state
-        vanishing = camera.v0 - camera.focal_px * math.tan(theta)
+        vanishing = camera.v0 - camera.focal_v_px * math.tan(theta)
         assert abs(ground_scale(camera, theta, y, vanishing)) < ROUNDING_PX
         u, v = project_points(camera, state, 3.0, 1e9)
         assert (u, v) == pytest.approx((camera.u0, vanishing), abs=1e-4)
@@ -137,7 +144,7 @@ def printed_ends(scene: Scene, state: Floats) -> Floats:
     cosine, sine = math.cos(theta), math.sin(theta)
     motion = np.array([[1, 0, 0, x], [0, cosine, sine, y], [0, -sine, cosine, z], [0, 0, 0, 1]])
     camera = scene.camera
-    intrinsic = np.array([[camera.focal_px, 0, camera.u0], [0, -camera.focal_px, camera.v0], [0, 0, 1]])
+    intrinsic = np.array([[camera.focal_v_px, 0, camera.u0], [0, -camera.focal_v_px, camera.v0], [0, 0, 1]])
     homogeneous = [[[marking.x_m, 0, end, 1] for end in marking.ends_z_m] for marking in scene.runway.markings]
     q = np.array(homogeneous) @ motion.T[:, :3] @ intrinsic.T
     return q[..., :2] / q[..., 2:]
@@ -222,7 +229,7 @@ def test_the_rigid_camera_sees_the_whole_runway_from_every_state_of_all_27_cells
     visible = 0
     for lower, upper in zip(cells.lower, cells.upper, strict=True):
         rows = project(paper_scene, box_corners(lower, upper))[..., 1]
-        halfwidth = camera.focal_px * 0.1 / min(depth_range(lower, upper, end)[0] for end in (0.0, 0.3))
+        halfwidth = camera.focal_v_px * 0.1 / min(depth_range(lower, upper, end)[0] for end in (0.0, 0.3))
         visible += rows.min() >= 0 and rows.max() < camera.height and halfwidth < camera.width / 2
     assert visible == len(cells) == 27
 
@@ -292,7 +299,7 @@ def test_corners_alone_miss_up_to_0_03_px_of_an_ends_columns_in_9_of_27_cells(pa
     for cell, (lower, upper) in enumerate(zip(cells.lower, cells.upper, strict=True)):
         columns = project(paper_scene, box_corners(lower, upper))[:, 1, :, 0]
         for index, end in enumerate((0.0, 0.3)):
-            offset = camera.focal_px * 0.1 / depth_range(lower, upper, end)[1]
+            offset = camera.focal_v_px * 0.1 / depth_range(lower, upper, end)[1]
             missed[cell, index] = columns[:, index].min() - (camera.u0 + offset)
             beta = math.atan2(upper[2], end + upper[3])
             assert (missed[cell, index] > ROUNDING_PX) == (lower[0] < beta < upper[0])
@@ -307,6 +314,6 @@ def test_the_column_of_a_line_at_a_row_turns_in_pitch_where_tan_theta_tau_is_1()
     camera = GENERAL.camera
     for tangent, y in itertools.product((0.5, 1.0, 2.0), (0.3, 1.0, 40.0)):
         turn = math.atan(1 / tangent)
-        row = camera.v0 + camera.focal_px * tangent
+        row = camera.v0 + camera.focal_v_px * tangent
         assert (np.diff(ground_scale(camera, np.linspace(turn - 0.4, turn, 100), y, row)) > 0).all()
         assert (np.diff(ground_scale(camera, np.linspace(turn, turn + 0.4, 100), y, row)) < 0).all()

@@ -46,11 +46,9 @@ class Case:
 
     def scale(self) -> Fraction:
         """g at the set's reference row, px per metre, exactly."""
-        camera = self.scene.camera
-        focal = Fraction(camera.focal_length_m) / Fraction(camera.pixel_pitch_m)
-        row = Fraction(camera.v0) + focal * Fraction(float(self.sets.tangent[0]))
         cosine, sine = turn(self.state.tangent)
-        return (cosine * (row - Fraction(camera.v0)) + focal * sine) / self.state.y
+        fall = cosine * Fraction(float(self.sets.tangent[0])) + sine
+        return RationalView.of(self.scene.to_dict()).focal_u * fall / self.state.y
 
     def held_by(self, sets: StateSet) -> bool:
         """Is the state in what is left of the set? Decided in fractions."""
@@ -75,18 +73,23 @@ def around(draw: st.DrawFn, value: float, width: float) -> list[float]:
     return [value - share * width, value + (1 - share) * width]
 
 
+def pinhole(draw: st.DrawFn, width: int, height: int, focal_px: float) -> Camera:
+    """A camera whose pixels are square, or a tenth wider or taller."""
+    return Camera(width, height, focal_px=(draw(st.sampled_from([1.0, 0.9, 1.1])) * focal_px, focal_px))
+
+
 @st.composite
 def cases(draw: st.DrawFn) -> Case:
     """Cameras of 32 to 320 px from 0.3 to 300 m up over one to three markings, often side by side; sets up to a few pixels wide."""
     width, height = draw(st.integers(32, 320)), draw(st.integers(32, 240))
-    camera = Camera(width, height, draw(spread(0.6, 8)) * width * 1e-5, 1e-5)
+    camera = pinhole(draw, width, height, draw(spread(0.6, 8)) * width)
     y, slope = draw(spread(0.3, 300)), draw(spread(0.02, 3))  # of altitude over distance, at the nearest end
     distance = y / slope
     row = draw(st.floats(0.4, 1.1)) * height  # of the nearest end
-    theta = math.atan(slope) - math.atan((row - camera.v0) / camera.focal_px)
+    theta = math.atan(slope) - math.atan((row - camera.v0) / camera.focal_v_px)
     shift = draw(st.sampled_from([0.0, 1e4, -98_765.4]))
     state = RationalState.near([theta, shift, y, distance - shift])
-    scale = camera.focal_px * math.cos(theta) / (distance + y * slope) / (1 + slope * math.tan(theta))  # about that there
+    scale = camera.focal_u_px * math.cos(theta) / (distance + y * slope) / (1 + slope * math.tan(theta))  # about that there
     markings, column = [], draw(st.floats(-0.02, 1.02)) * width
     for number in range(draw(st.integers(1, 3))):
         across = (column - camera.u0) / scale
@@ -101,7 +104,7 @@ def cases(draw: st.DrawFn) -> Case:
     except SceneError:
         assume(False)
         raise
-    px = 1 / camera.focal_px
+    px = 1 / camera.focal_v_px
     theta_x_y_z = [
         around(draw, value, extent) for value, extent in zip(state.floats, (2 * px, distance * px, 0.1 * y, 0.2 * distance), strict=True)
     ]
@@ -193,13 +196,13 @@ def test_altitude_and_scale_keep_the_state(case: Case) -> None:
 def whole_markings(draw: st.DrawFn) -> Case:
     """One marking, all of it in the frame with a margin of 8 px, not flatter than a pixel a row; the set is the state but for 2^-44."""
     width, height = draw(st.integers(96, 320)), draw(st.integers(96, 240))
-    camera = Camera(width, height, draw(st.floats(0.8, 3)) * width * 1e-5, 1e-5)
+    camera = pinhole(draw, width, height, draw(st.floats(0.8, 3)) * width)
     y, theta = draw(spread(0.3, 300)), draw(st.floats(0.1, 1.0))
     rows = draw(st.floats(8, height / 2)), draw(st.floats(height / 2 + 4, height - 8))
-    assume((rows[0] - camera.v0) / camera.focal_px + math.tan(theta) > 0.05)
-    far, near = (y / math.tan(theta + math.atan((row - camera.v0) / camera.focal_px)) for row in rows)
+    assume((rows[0] - camera.v0) / camera.focal_v_px + math.tan(theta) > 0.05)
+    far, near = (y / math.tan(theta + math.atan((row - camera.v0) / camera.focal_v_px)) for row in rows)
     assume(near > 0.01 * y)  # ahead of the camera
-    scales = [camera.focal_px / (y * math.sin(theta) + d * math.cos(theta)) for d in (far, near)]
+    scales = [camera.focal_u_px / (y * math.sin(theta) + d * math.cos(theta)) for d in (far, near)]
     reach = min((width / 2 - 8) / scales[1], (rows[1] - rows[0]) / (scales[1] - scales[0]))
     across = draw(st.sampled_from([-1, 1])) * draw(st.floats(0.05, 1)) * reach
     shift = draw(st.sampled_from([0.0, 1e4, -98_765.4]))

@@ -95,7 +95,9 @@ def test_ends_are_the_rigid_cameras(rng: Rng) -> None:
             ends = np.array(stage.view.segments(state), dtype=np.float64)
             np.testing.assert_allclose(ends, project(scene, state.floats), rtol=0, atol=1e-9)
             if exact:
-                rounded = replace(stage.view, focal=Fraction(scene.camera.focal_px)).segments(state)
+                rounded = replace(
+                    stage.view, focal_u=Fraction(scene.camera.focal_u_px), focal_v=Fraction(scene.camera.focal_v_px)
+                ).segments(state)
                 assert rounded == exact_ends(scene, state.tangent, state.x, state.y, state.z)
 
 
@@ -103,15 +105,16 @@ def test_a_camera_that_is_off_is_yawed_then_rolled_zoomed_and_shifted(rng: Rng) 
     stage = stage_of(FREE_X)
     yaw, roll, zoom, shift = 0.02, -0.03, 1.01, np.array([0.7, -0.4])
     off = replace(stage.view, yaw=Fraction(math.tan(yaw / 2)), roll=Fraction(math.tan(roll / 2)))
-    off = replace(off, focal=off.focal * Fraction(zoom), u0=off.u0 + Fraction(shift[0]), v0=off.v0 + Fraction(shift[1]))
+    off = replace(off, focal_u=off.focal_u * Fraction(zoom), focal_v=off.focal_v * Fraction(zoom))
+    off = replace(off, u0=off.u0 + Fraction(shift[0]), v0=off.v0 + Fraction(shift[1]))
     camera = FREE_X.camera
     for _ in range(10):
         state = states.uniform(rng, stage)
-        a, b = np.moveaxis((project(FREE_X, state.floats) - [camera.u0, camera.v0]) / camera.focal_px, -1, 0)
+        a, b = np.moveaxis((project(FREE_X, state.floats) - [camera.u0, camera.v0]) / camera.focal_v_px, -1, 0)
         depth = a * math.sin(yaw) + math.cos(yaw)
         a, b = (a * math.cos(yaw) - math.sin(yaw)) / depth, b / depth
         a, b = a * math.cos(roll) - b * math.sin(roll), a * math.sin(roll) + b * math.cos(roll)
-        expected = np.stack([a, b], axis=-1) * camera.focal_px * zoom + shift + [camera.u0, camera.v0]
+        expected = np.stack([a, b], axis=-1) * camera.focal_v_px * zoom + shift + [camera.u0, camera.v0]
         np.testing.assert_allclose(np.array(off.segments(state), dtype=np.float64), expected, rtol=0, atol=1e-8)
 
 

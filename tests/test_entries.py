@@ -39,15 +39,15 @@ def assert_guaranteed(scene: Scene, tensors: Tensors) -> int:
     sets, camera = entries.sets(np.ones(tensors["must_light_size"].shape, dtype=bool)), scene.camera
     for bounds, low, high in zip((sets.theta, sets.x, sets.y, sets.z), scene.domain.lower, scene.domain.upper, strict=True):
         assert ((low <= bounds[:, 0]) & (bounds[:, 0] <= bounds[:, 1]) & (bounds[:, 1] <= high)).all()
-    row = camera.v0 + camera.focal_px * sets.tangent[:, None]
+    row = camera.v0 + camera.focal_v_px * sets.tangent[:, None]
     assert ((row >= -1e-9) & (row <= camera.height + 1 + 1e-9)).all()
     theta = sets.theta[:, :1] + SHARES * (sets.theta[:, 1:] - sets.theta[:, :1])
-    assert (row - (camera.v0 - camera.focal_px * np.tan(theta)) >= BELOW_HORIZON_PX - 1e-9).all()
+    assert (row - (camera.v0 - camera.focal_v_px * np.tan(theta)) >= BELOW_HORIZON_PX - 1e-9).all()
     assert (sets.scale[:, 0] <= sets.scale[:, 1]).all()
     allowed = np.stack([ground_scale(camera, theta, y[:, None], row) for y in sets.y.T], axis=-1)
     margin = 1 + 2 * OUTWARD_RELATIVE
     assert (sets.scale[:, 0] * margin >= allowed.min(axis=(1, 2))).all()
-    peak = camera.focal_px * np.sqrt(1 + sets.tangent**2) / sets.y[:, 0]  # where a theta inside the box looks straight down the row
+    peak = camera.focal_v_px * np.sqrt(1 + sets.tangent**2) / sets.y[:, 0]  # where a theta inside the box looks straight down the row
     assert (sets.scale[:, 1] <= margin * np.maximum(allowed.max(axis=(1, 2)), peak)).all()
     assert sets.scale.min(initial=1) > 0
     return len(sets)
@@ -67,7 +67,7 @@ def test_scales_are_drawn_in_to_what_the_states_have(paper: tuple[Scene, Tensors
     assert ((lower <= sets.scale[:, 0]) & (sets.scale[:, 1] <= upper)).all()
     assert 0 < ((lower < sets.scale[:, 0]) | (sets.scale[:, 1] < upper)).sum() < len(sets)
     rng = np.random.default_rng(0)
-    row = scene.camera.v0 + scene.camera.focal_px * sets.tangent
+    row = scene.camera.v0 + scene.camera.focal_v_px * sets.tangent
     for _ in range(50):
         theta, y = (bounds[:, 0] + rng.random(len(sets)) * (bounds[:, 1] - bounds[:, 0]) for bounds in (sets.theta, sets.y))
         scale = ground_scale(scene.camera, theta, y, row)
@@ -138,7 +138,7 @@ def test_a_reference_row_at_the_horizon_is_refused(paper: tuple[Scene, Tensors])
     tables = scene.to_dict()
     tables["camera"]["principal_point"] = [320.0, 600.0]
     theta = np.clip(tensors["theta_lower"].astype(float), scene.domain.lower[0], scene.domain.upper[0])
-    horizon = 600 - scene.camera.focal_px * np.tan(theta)
+    horizon = 600 - scene.camera.focal_v_px * np.tan(theta)
     for below_px, message in ((0.51, "an entry's scale is"), (0.49, "reference_row is .*, which is not below the horizon")):
         with pytest.raises(ModelError, match=message):
             Entries.of(Scene.from_dict(tables), {**tensors, "reference_row": horizon + below_px}, "model")

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scenes import BARELY_ABOVE, BARELY_BELOW, CUT_LEFT, FREE_X, OFF_BY, PAPER, SHIFTED, THREE_MARKINGS, UNLIKE_MARKINGS, Floats, tolerant
 
-from build_model.hough_bank import CellBank, LineBoxes, _scale_bins, cell_bank, line_boxes
+from build_model.hough_bank import CellBank, _scale_bins, cell_bank, line_boxes
+from build_model.line_boxes import LineBoxes
 from build_model.partition import partition
 from runtime.camera import ground_scale, project, project_points
 from runtime.image import image_of_ends, runway_image

@@ -75,7 +75,7 @@ def meets(start: Point, stop: Point, column: int, row: int, widen: Fraction | No
 def exact_ends(scene: Scene, tangent: Fraction, x: Fraction, y: Fraction, z: Fraction) -> list[tuple[Point, Point]]:
     """Near and far end of each marking at the pitch with tan(theta/2) = tangent: the rigid camera in rational numbers."""
     cosine, sine = (1 - tangent**2) / (1 + tangent**2), 2 * tangent / (1 + tangent**2)
-    focal, u0, v0 = (Fraction(value) for value in (scene.camera.focal_px, scene.camera.u0, scene.camera.v0))
+    focal, u0, v0 = (Fraction(value) for value in (scene.camera.focal_v_px, scene.camera.u0, scene.camera.v0))
 
     def end(p_x: float, p_z: float) -> Point:
         ahead = Fraction(p_z) + z

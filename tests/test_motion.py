@@ -39,7 +39,7 @@ def test_the_scale_of_a_moved_state(sight: Sight, turn: float, climb: float, ahe
     tangent = arb(sets.tangent[0])
     fall = tangent * theta.cos() + theta.sin()
     altitude = arb(sight.state[2]) + arb(step[2])
-    scale = sight.camera.focal_px * fall / altitude
+    scale = sight.camera.focal_v_px * fall / altitude
     low, high = sets.scale[0].tolist()
     assert arb(low) <= scale
     assert scale <= arb(high)
@@ -70,7 +70,7 @@ def test_moved_states_lie_in_the_moved_sets_and_nearly_fill_them(scene: Scene, d
     if not inside.any():
         return
     after = after[inside]
-    row = scene.camera.v0 + scene.camera.focal_px * found.tangent[0]
+    row = scene.camera.v0 + scene.camera.focal_v_px * found.tangent[0]
     scales = ground_scale(scene.camera, after[:, 0], after[:, 2], row)
     for values, side in zip((*after.T, scales), (found.theta, found.x, found.y, found.z, found.scale), strict=True):
         assert side[0, 0] <= values.min()
@@ -111,7 +111,7 @@ def test_unknown_rates_leave_the_domain() -> None:
     domain = Box(PAPER.domain.lower, PAPER.domain.upper)
     middle = domain.centre
     tangent = np.array([0.1])
-    scale = float(ground_scale(PAPER.camera, middle[0], middle[2], PAPER.camera.v0 + 0.1 * PAPER.camera.focal_px))
+    scale = float(ground_scale(PAPER.camera, middle[0], middle[2], PAPER.camera.v0 + 0.1 * PAPER.camera.focal_v_px))
     sides = [np.array([[value, value]]) for value in middle]
     after = moved(PAPER.camera, StateSet(*sides, np.array([[scale, scale]]), tangent), motion.over(1), domain)
     np.testing.assert_allclose(after.lower[0], domain.lower, atol=1e-9)

@@ -79,7 +79,7 @@ def test_scenes_are_of_every_kind_and_size() -> None:
     for sides, (low, high) in ((widths, WIDTH_PX), (heights, HEIGHT_PX)):
         assert low <= sides.min() < 2 * low
         assert high / 1.5 < sides.max() <= high
-    zooms = np.array([scene.camera.focal_px / scene.camera.width for scene in scenes])
+    zooms = np.array([scene.camera.focal_v_px / scene.camera.width for scene in scenes])
     assert FOCAL_WIDTHS[0] <= zooms.min() < 0.7
     assert 7 < zooms.max() <= FOCAL_WIDTHS[1]
     assert {each.kinds[0] for each in drawn} == set(PLACES)
@@ -96,7 +96,7 @@ def test_scenes_are_of_every_kind_and_size() -> None:
 PLACED: dict[str, Callable[[np.ndarray, Camera, float], bool]] = {
     "within one row": lambda rows, _camera, _theta: len(np.unique(np.floor(rows))) == 1,
     "within two rows": lambda rows, _camera, _theta: np.floor(rows).max() - np.floor(rows).min() <= 1,
-    "horizon in view": lambda _rows, camera, theta: 0 <= camera.v0 - camera.focal_px * math.tan(theta) <= camera.height,
+    "horizon in view": lambda _rows, camera, theta: 0 <= camera.v0 - camera.focal_v_px * math.tan(theta) <= camera.height,
     "looking straight down": lambda _rows, _camera, theta: math.pi / 2 - 0.3 <= theta < math.pi / 2,
     "near end far below": lambda rows, _camera, _theta: bool((rows[:, 1] >= 499).all()),
     "near end a million rows below": lambda rows, _camera, _theta: bool((rows[:, 1] >= 4.99e5).all()),

@@ -60,7 +60,7 @@ SCENES = pytest.mark.parametrize("scene", CASES.values(), ids=CASES)
 
 def holds(scene: Scene, pieces: StateSet, state: Floats) -> bool:
     """Is the state in one of the pieces? The scale up to float64's error."""
-    row = scene.camera.v0 + scene.camera.focal_px * pieces.tangent
+    row = scene.camera.v0 + scene.camera.focal_v_px * pieces.tangent
     scale = ground_scale(scene.camera, state[0], state[2], row)
     inside = ((pieces.lower <= state) & (state <= pieces.upper)).all(axis=1)
     return bool((inside & ~inverted(pieces.scale[:, 0], scale) & ~inverted(scale, pieces.scale[:, 1])).any())

@@ -41,7 +41,7 @@ class Sight:
 
     def scale(self, row: float) -> arb:
         """g at a row, px per metre."""
-        return self.camera.focal_px * self.camera.ray(float(self.state[0]), row)[0] / arb(self.state[2])
+        return self.camera.focal_v_px * self.camera.ray(float(self.state[0]), row)[0] / arb(self.state[2])
 
     def sets(self) -> StateSet:
         scale = float(self.scale(self.reference_row).mid())
@@ -76,7 +76,7 @@ def sights(draw: st.DrawFn) -> Sight:
     except SceneError:  # too near the horizon, or too far from the origin, to be rounded safely
         reject()
     middle = distance + draw(st.floats(0, 1)) * length
-    row = float(np.round(camera.v0 + camera.focal_px * math.tan(math.atan2(y, middle) - theta)))
+    row = float(np.round(camera.v0 + camera.focal_v_px * math.tan(math.atan2(y, middle) - theta)))
     sight = Sight(scene, state, row)
     assume(sight.camera.ray(theta, row)[0] > 1e-5)
     return sight
@@ -90,7 +90,7 @@ def spacing(sight: Sight) -> float:
 
 @given(sight=sights())
 def test_rows_of_ends(sight: Sight) -> None:
-    focal, sets = sight.scene.camera.focal_px, sight.sets()
+    focal, sets = sight.scene.camera.focal_v_px, sight.sets()
     for (low, high), distance in zip(_ends(sight.scene, sets), sight.distances, strict=True):
         row = sight.camera.row(float(sight.state[0]), arb(sight.state[2]), distance)
         assert arb(low[0, 0]) <= row

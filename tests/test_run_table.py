@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from build_model.filter_tables import RunTable
-from build_model.hough_bank import CellBank, LineBoxes
+from build_model.hough_bank import CellBank
+from build_model.line_boxes import LineBoxes
 from build_model.pixel_mask import VerticalRuns, runs_of
 from build_model.run_table import BLOCK_COST, block_borders, mirrored, run_table, spatial_runs
 from build_model.window import Window

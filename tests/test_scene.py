@@ -62,7 +62,7 @@ def test_the_papers_scene_is_read(paper_scene: Scene) -> None:
     assert paper_scene.domain.cell_count == 27
     assert paper_scene.camera.shape == (480, 640)
     assert (paper_scene.camera.u0, paper_scene.camera.v0) == (320, 240)
-    assert paper_scene.camera.focal_px == pytest.approx(1600 / 3, rel=1e-15)
+    assert paper_scene.camera.focal_v_px == pytest.approx(1600 / 3, rel=1e-15)
     assert [marking.name for marking in paper_scene.runway.markings] == ["L", "R"]
     assert paper_scene.runway.x_m.tolist() == [-0.1, 0.1]
     assert paper_scene.runway.ends_z_m.tolist() == [[0.0, 0.3], [0.0, 0.3]]
@@ -195,6 +195,19 @@ BAD_VALUES: list[tuple[KeyPath, Any, str]] = [
     (("camera", "pixel_pitch_m"), -15e-6, "camera.pixel_pitch_m: found -1.5e-05"),
     (("camera", "focal_length_m"), 1e308, "camera.focal_length_m / pixel_pitch_m: found inf"),
     (("camera", "focal_length_m"), 1e-9, "camera.focal_length_m / pixel_pitch_m: found 6.6"),
+    (("camera", "focal_px"), [533.0, 533.0], "camera.focal_length_m and pixel_pitch_m: found given beside focal_px"),
+    (("camera", "focal_px"), [533.0], "camera.focal_px: found [533.0]; give 2 values"),
+    (("camera", "focal_length_m"), ABSENT, "camera.focal_length_m: found nothing; this key is required, or focal_px = [fx, fy]"),
+    (
+        ("camera", "distortion"),
+        {"model": "fov", "coefficients": [1.0]},
+        "camera.distortion.model: found fov; give one of radial-tangential",
+    ),
+    (("camera", "distortion"), {"model": "fisheye", "coefficients": [0.1] * 5}, "fisheye has 4 of them"),
+    (("camera", "distortion"), {"model": "radial-tangential", "coefficients": [0.1] * 8}, "radial-tangential has 4 or 5 of them"),
+    (("camera", "distortion"), {"model": "fisheye", "coefficients": [1e9] * 4}, "camera.distortion.coefficients: found"),
+    (("camera", "mount"), {"roll_rad": 2.0}, "camera.mount.roll_rad: found 2.0"),
+    (("camera", "mount"), {"yaw_rad": 0.1}, "camera.mount: found a camera that is turned in the aircraft"),
     (("camera", "principal_point"), [320.0], "camera.principal_point: found [320.0]; give 2 values"),
     (("camera", "principal_point"), [320.0, 240.0, 1.0], "give 2 values"),
     (("camera", "principal_point"), [320.0, 1e9], "camera.principal_point: found (320.0, 1000000000.0)"),
@@ -285,7 +298,7 @@ def test_float64_keeps_half_the_margin_on_every_scene_that_is_taken(
     width, height = (2**side for side in sides)
     camera = Camera(width, height, 2**focal * 1e-5, 1e-5)
     shift, ahead, length, y = (10.0**power for power in logarithms)
-    theta = math.atan2(y, ahead) - view * math.atan(height / 2 / camera.focal_px)
+    theta = math.atan2(y, ahead) - view * math.atan(height / 2 / camera.focal_v_px)
     try:
         scene = one_marking(camera, shift, ahead, length, y, theta)
     except SceneError:

@@ -259,7 +259,7 @@ def test_a_runway_of_kilometres_is_drawn_to_its_far_end():
         seen = project_points(AIRPORT.camera, state, x_m, along)
         light = np.exp(ground.log_light(seen[:, 0], seen[:, 1], flight.views(start)))[0]
         covered = (light - target.ground_reflectance) / (1 - target.ground_reflectance)
-        across_m = state[2] / AIRPORT.camera.focal_px / (state[2] / (along + state[3]))
+        across_m = state[2] / AIRPORT.camera.focal_v_px / (state[2] / (along + state[3]))
         assert (covered > 0.5 * np.minimum(0.9 / across_m, 1)).all() if lit else (covered < 0.01).all()
     assert state[2] / (along[-1] + state[3]) < simulator.FLATTEST_FALL
 

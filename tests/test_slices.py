@@ -20,7 +20,7 @@ SCENES = pytest.mark.parametrize("scene", [PAPER, FREE_X, STRIP, AIRPORT], ids=[
 
 def holds(scene: Scene, sets: StateSet, states: Floats) -> np.ndarray:
     """(states, sets): True where a set holds a state, its scale included, up to float64's rounding of the scale here."""
-    rows = scene.camera.v0 + scene.camera.focal_px * sets.tangent
+    rows = scene.camera.v0 + scene.camera.focal_v_px * sets.tangent
     scale = ground_scale(scene.camera, states[:, :1], states[:, 2:3], rows)
     inside = (sets.scale[:, 0] <= scale * (1 + 1e-12)) & (scale * (1 - 1e-12) <= sets.scale[:, 1])
     return inside & ((sets.lower <= states[:, None]) & (states[:, None] <= sets.upper)).all(axis=2)
@@ -57,7 +57,7 @@ def test_slices_of_one_set_keep_pitch_and_altitude_together(scene: Scene, data: 
     same = same[~same.empty]
     assert (same.scale[:, 0] >= sets.scale[0, 0] * (1 - 1e-9)).all()
     assert (same.scale[:, 1] <= sets.scale[0, 1] * (1 + 1e-9)).all()
-    tangent = float(sets.tangent[0]) + 20 / scene.camera.focal_px
+    tangent = float(sets.tangent[0]) + 20 / scene.camera.focal_v_px
     other = sliced(scene.camera, sets, slice_edges(sets.theta), tangent)
     other = other[~other.empty]
     assert holds(scene, other, states).any(axis=1).all()
@@ -97,7 +97,7 @@ def test_a_box_cuts_sets_exactly() -> None:
 def test_a_row_above_the_horizon_gives_way_to_one_below() -> None:
     box = Box([-0.2, 0, 1, 10], [0.3, 0, 2, 20])
     (tangent,) = covering(AIRPORT.camera, box, 0.0).tangent
-    assert AIRPORT.camera.focal_px * (tangent + np.tan(-0.2)) == pytest.approx(0.5)
+    assert AIRPORT.camera.focal_v_px * (tangent + np.tan(-0.2)) == pytest.approx(0.5)
 
 
 # --- all but q ---

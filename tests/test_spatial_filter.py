@@ -109,7 +109,7 @@ def test_the_reference_row_is_where_the_middle_sees_the_runway() -> None:
         theta, _, y, z = (lower + upper) / 2
         row = reference_row(PAPER.camera, lower, upper, 0.15)
         assert row == round(float(row_of_point(PAPER.camera, theta, y, z + 0.15)))
-        assert row > PAPER.camera.v0 - PAPER.camera.focal_px * np.tan(lower[0])
+        assert row > PAPER.camera.v0 - PAPER.camera.focal_v_px * np.tan(lower[0])
 
 
 @given(theta=st.floats(-0.5, 1.4), width=st.floats(0, 0.1), y=st.floats(0.3, 300), z=st.floats(0.1, 3000), v0=st.floats(-1000, 1000))
@@ -118,7 +118,7 @@ def test_the_reference_row_keeps_to_the_frame_and_off_the_horizon(theta: float, 
     camera = Camera(640, 480, 0.02, 1e-5, (320.0, v0))
     lower, upper = np.array([theta, 0.0, y, z]), np.array([theta + width, 0.0, y, z])
     seen = float(row_of_point(camera, theta + width / 2, y, z + 1))
-    horizon = v0 - camera.focal_px * np.tan(theta)
+    horizon = v0 - camera.focal_v_px * np.tan(theta)
     try:
         row = reference_row(camera, lower, upper, 1.0)
     except SceneError:

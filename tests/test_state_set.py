@@ -40,7 +40,7 @@ SCENES = pytest.mark.parametrize("scene", [PAPER, FREE_X, WIDE], ids=["paper", "
 
 
 def reference_scale(scene: Scene, sets: StateSet, states: Floats) -> Floats:
-    row = scene.camera.v0 + scene.camera.focal_px * sets.tangent[0]
+    row = scene.camera.v0 + scene.camera.focal_v_px * sets.tangent[0]
     return ground_scale(scene.camera, states[:, 0], states[:, 2], row)
 
 
@@ -102,7 +102,7 @@ def test_scales_and_columns_lie_in_their_ranges(scene: Scene, data: st.DataObjec
     """At single rows and between two; `scale_ratio` is claimed below the horizon only, elsewhere it stops at 0."""
     sets, states = draw(scene, data)
     camera = scene.camera
-    rows = camera.v0 + camera.focal_px * sets.tangent[0] + np.array([-40.0, -7.5, 0.0, 3.25, 60.0])
+    rows = camera.v0 + camera.focal_v_px * sets.tangent[0] + np.array([-40.0, -7.5, 0.0, 3.25, 60.0])
     tangent = tangent_of_row(camera, rows)[None]
     ratio_low, ratio_high = (bound[:, 0] for bound in scale_ratio(sets, tangent.T))
     own_low, own_high = (bound[0] for bound in scale_between(camera, sets, tangent, tangent))

@@ -28,7 +28,8 @@ from build_model.assembly import assemble
 from build_model.export import build_banks, export_model
 from build_model.filter_graph import filter_graph
 from build_model.filter_tables import FilterTables
-from build_model.hough_bank import CellBank, LineBoxes
+from build_model.hough_bank import CellBank
+from build_model.line_boxes import LineBoxes
 from build_model.pixel_mask import runs_of
 from build_model.verify import cli
 from build_model.verify.ball_camera import PRECISION_BITS, BallCamera, BallEntry, Ends, Slice, columns, columns_crossed
@@ -58,10 +59,11 @@ OFF_BY = Calibration(roll_rad=0.001, yaw_rad=0.0005, focal_relative=0.001, princ
 TOLERANT = replace(SCENE, calibration=OFF_BY, tolerance=Tolerance(line_px=1, missed_budget=2, extra_budget=3))
 FREE = replace(
     SCENE,
+    camera=Camera(width=128, height=96, focal_px=(206.0, 198.0)),
     runway=Runway((*SCENE.runway.markings, Marking("C", 0.0, 0.2, 0.5))),
     domain=replace(SCENE.domain, x_m=Axis((0.0,), 0.01), y_m=Axis((0.8,), 0.04)),
 )
-SCENES = {"paper's shape": SCENE, "tolerant": TOLERANT, "free x, three markings": FREE, "several rows a cell": SCENE}
+SCENES = {"paper's shape": SCENE, "tolerant": TOLERANT, "oblong pixels, free x, three markings": FREE, "several rows a cell": SCENE}
 WIDTH = 5
 """Of the rows in the last scene's model."""
 Rng = np.random.Generator
@@ -599,7 +601,7 @@ def test_boxes_that_the_refinement_cannot_rely_on_are_refuted(model: Model) -> N
     tables = model.tables()
     check_boxes(SCENE, tables)
     rows = tables.reference_row[tables.must_light_size != PADDING_SIZE]
-    horizon = SCENE.camera.v0 - SCENE.camera.focal_px * np.tan(tables.state_lower[..., 0].max())
+    horizon = SCENE.camera.v0 - SCENE.camera.focal_v_px * np.tan(tables.state_lower[..., 0].max())
     camera = replace(SCENE.camera, principal_point=(SCENE.camera.u0, SCENE.camera.v0 + float(rows.min() - horizon)))
     with pytest.raises(Refuted, match="not certainly below the horizon of its states; cell 0; entry 0"):
         check_boxes(replace(SCENE, camera=camera), tables)
@@ -770,11 +772,11 @@ def test_displacement_holds_every_camera_within_the_calibration() -> None:
     signs = rng.choice([-1, 1], (2000, 5)) * rng.choice([1.0, 0.5], (2000, 5))
     yaw, roll, share, right, down = (signs * [OFF_BY.yaw_rad, OFF_BY.roll_rad, OFF_BY.focal_relative, *[OFF_BY.principal_px] * 2]).T
     u, v = rng.choice([5, 52, 100], 2000), rng.choice([10, 35, 60], 2000)
-    a, b = (u - camera.u0) / camera.focal_px, (v - camera.v0) / camera.focal_px
+    a, b = (u - camera.u0) / camera.focal_v_px, (v - camera.v0) / camera.focal_v_px
     depth = a * np.sin(yaw) + np.cos(yaw)
     a, b = (a * np.cos(yaw) - np.sin(yaw)) / depth, b / depth
     a, b = a * np.cos(roll) - b * np.sin(roll), a * np.sin(roll) + b * np.cos(roll)
-    focal = camera.focal_px * (1 + share)
+    focal = camera.focal_v_px * (1 + share)
     shift = np.maximum(np.abs(camera.u0 + right + focal * a - u), np.abs(camera.v0 + down + focal * b - v))
     assert shift.max() <= bound
     assert shift.max() > 0.95 * bound

@@ -47,14 +47,15 @@ def _stack(parts: Sequence[RoundedInterval], axis: int) -> RoundedInterval:
 def projection_jacobian(scene: Scene, lower: ArrayLike, upper: ArrayLike) -> Interval:
     """Bounds of the Jacobian of zeta = (u1, v1, u2, v2) by (theta, x, y, z), by interval arithmetic.
 
-        du = F (X Y / Z^2, -1 / Z, -X sin(theta) / Z^2, -X cos(theta) / Z^2)
-        dv = F (-1 - (Y / Z)^2, 0, d / Z^2, -y / Z^2)
+        du = F_u (X Y / Z^2, -1 / Z, -X sin(theta) / Z^2, -X cos(theta) / Z^2)
+        dv = F_v (-1 - (Y / Z)^2, 0, d / Z^2, -y / Z^2)
 
     `lower`, `upper`: boxes of states, (..., 4). Returns two arrays (..., markings, 4, 4), px per rad or m, rounded outward.
     Raises `ValueError` if intervals cannot exclude Z <= 0.
     """
     geometry = _end_geometry(scene, np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64))
-    one, focal, squared = RoundedInterval.of(1.0), RoundedInterval.of(scene.camera.focal_px), geometry.depth.square()
+    one, squared = RoundedInterval.of(1.0), geometry.depth.square()
+    focal = RoundedInterval.of(np.array([[scene.camera.focal_u_px], [scene.camera.focal_v_px]]))  # of the rows u and v
     side, rise = geometry.across / geometry.depth, geometry.upward / geometry.depth
     shrink = side / geometry.depth
     u = _stack([side * rise, -(one / geometry.depth), -(shrink * geometry.sine), -(shrink * geometry.cosine)], axis=-1)
@@ -91,9 +92,8 @@ def _zeta_mixed(scene: Scene, lower: Floats, upper: Floats) -> Interval:
 
 def _zeta_intervals(scene: Scene, lower: Floats, upper: Floats) -> Interval:
     geometry, camera = _end_geometry(scene, lower, upper), scene.camera
-    focal = RoundedInterval.of(camera.focal_px)
-    u = RoundedInterval.of(camera.u0) + focal * (geometry.across / geometry.depth)
-    v = RoundedInterval.of(camera.v0) - focal * (geometry.upward / geometry.depth)
+    u = RoundedInterval.of(camera.u0) + RoundedInterval.of(camera.focal_u_px) * (geometry.across / geometry.depth)
+    v = RoundedInterval.of(camera.v0) - RoundedInterval.of(camera.focal_v_px) * (geometry.upward / geometry.depth)
     zeta = _stack([u, v], axis=-1)
     shape = (*zeta.lower.shape[:-2], 4)
     return zeta.lower.reshape(shape), zeta.upper.reshape(shape)
@@ -109,7 +109,7 @@ def _zeta_closed_form(scene: Scene, lower: Floats, upper: Floats) -> Interval:
     if np.any(depths[0] <= 0):
         raise ValueError(f"box: an end has a depth Z of {depths[0].min():.3g} m; narrow the box to states with the runway ahead")
     quotients = [x / depth for x in across for depth in depths]
-    u = [camera.u0 + camera.focal_px * extreme.reduce(quotients) for extreme in (np.minimum, np.maximum)]
+    u = [camera.u0 + camera.focal_u_px * extreme.reduce(quotients) for extreme in (np.minimum, np.maximum)]
     v = row_of_point(camera, theta[1], y[0], ahead[1]), row_of_point(camera, theta[0], y[1], ahead[0])
     low, high = (np.stack(np.broadcast_arrays(*pair), axis=-1) for pair in zip(u, v, strict=True))
     return low.reshape(*low.shape[:-2], 4), high.reshape(*high.shape[:-2], 4)

@@ -3,18 +3,18 @@
 This is the verifier's own camera; it shares no formula and no rounding with the masks' construction. A ground point d metres ahead,
 X = p_x - x across, is seen by a camera y metres up that is pitched down by theta (conventions: `runtime.camera`):
 
-    Y = -y cos(theta) + d sin(theta)    Z = y sin(theta) + d cos(theta)    u = u0 + F X/Z    v = v0 - F Y/Z
+    Y = -y cos(theta) + d sin(theta)    Z = y sin(theta) + d cos(theta)    u = u0 + F_u X/Z    v = v0 - F_v Y/Z
 
-Turned back, with tau = (v - v0)/F = -Y/Z, the point that row v shows has
+Turned back, with tau = (v - v0)/F_v = -Y/Z, the point that row v shows has
 
     y = Z fall,   fall  = sin(theta) + tau cos(theta)
-    d = Z reach,  reach = cos(theta) - tau sin(theta)        u = u0 + X g,  g = F/Z
+    d = Z reach,  reach = cos(theta) - tau sin(theta)        u = u0 + X g,  g = F_u/Z
 
-so that g, the px per metre across the ground, is F fall/y as well as F reach/d. With theta + atan(tau) in (-pi, pi), fall and reach
+so that g, the px per metre across the ground, is F_u fall/y as well as F_u reach/d. With theta + atan(tau) in (-pi, pi), fall and reach
 are sqrt(1 + tau^2) times its sine and cosine: their signs at the two ends of a slice of theta show where they rise and fall. And
 
     fall(v)/fall(r) = 1 + (tau_v - tau_r) / (tau_r + tan(theta))     is monotone in theta where row r sees the ground,
-    dv/dy = F d/Z^2 > 0,   dv/dd = -F y/Z^2 < 0,   dv/dtheta = -F (1 + (Y/Z)^2) < 0     for y, d, Z > 0.
+    dv/dy = F_v d/Z^2 > 0,   dv/dd = -F_v y/Z^2 < 0,   dv/dtheta = -F_v (1 + (Y/Z)^2) < 0     for y, d, Z > 0.
 
 Everything is evaluated at points, as balls of 64 bits, and a comparison holds only if it holds for all of both balls. Within one
 theta each bound is the exact one; over a slice of theta it is an outer one that tends to it as the slice narrows.
@@ -43,11 +43,19 @@ def greatest(first: arb, second: arb) -> arb:
     return first if first > second else second
 
 
+def focal_lengths(camera: Camera) -> tuple[arb, arb]:
+    """F_u and F_v, px: those stated, or the quotient of the lengths."""
+    if camera.focal_px is not None:
+        return arb(camera.focal_px[0]), arb(camera.focal_px[1])
+    focal = arb(camera.focal_length_m) / arb(camera.pixel_pitch_m)
+    return focal, focal
+
+
 class BallCamera:
     """A scene's camera; sines, cosines and rays are kept, as the slices of many entries share them."""
 
     def __init__(self, camera: Camera) -> None:
-        self.focal_px = arb(camera.focal_length_m) / arb(camera.pixel_pitch_m)
+        self.focal_u_px, self.focal_v_px = focal_lengths(camera)
         self.u0, self.v0 = arb(camera.u0), arb(camera.v0)
         self._turns: dict[float, BallInterval] = {}
         self._rays: dict[tuple[float, float], BallInterval] = {}
@@ -60,8 +68,8 @@ class BallCamera:
         return turn
 
     def tangent(self, row: float) -> arb:
-        """tau = (v - v0)/F of a row."""
-        return (arb(row) - self.v0) / self.focal_px
+        """tau = (v - v0)/F_v of a row."""
+        return (arb(row) - self.v0) / self.focal_v_px
 
     def ray(self, theta: float, row: float) -> BallInterval:
         """fall and reach of a row's ray, y/Z and d/Z."""
@@ -74,7 +82,7 @@ class BallCamera:
     def row(self, theta: float, y: arb, d: arb) -> arb:
         """v of a ground point, from Y and Z; not finite unless Z is certainly not 0."""
         sine, cosine = self.turn(theta)
-        return self.v0 - self.focal_px * (d * sine - y * cosine) / (y * sine + d * cosine)
+        return self.v0 - self.focal_v_px * (d * sine - y * cosine) / (y * sine + d * cosine)
 
     def fall_range(self, low: float, high: float, row: float) -> BallInterval:
         """Range of fall over theta in [low, high]: sqrt(1 + tau^2) times the sine of an angle in (-pi, pi)."""
@@ -144,8 +152,8 @@ class Slice:
         self.sees_ground = fall[0] > 0
         self.y = entry.y
         if self.sees_ground:
-            lowest = greatest(entry.y[0], camera.focal_px * fall[0] / entry.scale[1])
-            self.y = lowest, least(entry.y[1], camera.focal_px * fall[1] / entry.scale[0]) if entry.scale[0] > 0 else entry.y[1]
+            lowest = greatest(entry.y[0], camera.focal_u_px * fall[0] / entry.scale[1])
+            self.y = lowest, least(entry.y[1], camera.focal_u_px * fall[1] / entry.scale[0]) if entry.scale[0] > 0 else entry.y[1]
 
     @property
     def empty(self) -> bool:
@@ -185,13 +193,13 @@ class Slice:
         return near, far
 
     def scale_at(self, row: int) -> BallInterval:
-        """Range of g at a row: scale fall(row)/fall(reference row), and F fall/y within the cell's altitudes; 0 at the horizon."""
+        """Range of g at a row: scale fall(row)/fall(reference row), and F_u fall/y within the cell's altitudes; 0 at the horizon."""
         entry, camera = self.entry, self.entry.camera
         first, last = (camera.ray(theta, row)[0] / camera.ray(theta, entry.reference_row)[0] for theta in (self.low, self.high))
         fall = camera.fall_range(self.low, self.high, row)
         low, high = first.min(last).max(0), first.max(last).max(0)
-        lowest = greatest(entry.scale[0] * low, camera.focal_px * fall[0] / entry.y[1])
-        return lowest, least(entry.scale[1] * high, camera.focal_px * fall[1].max(0) / entry.y[0])
+        lowest = greatest(entry.scale[0] * low, camera.focal_u_px * fall[0] / entry.y[1])
+        return lowest, least(entry.scale[1] * high, camera.focal_u_px * fall[1].max(0) / entry.y[0])
 
     def scales_seen_in(self, row: int, ends: Ends) -> BallInterval | None:
         """Range of g over the points of a marking that lie in a row; None if no state of the slice shows any there.
@@ -212,10 +220,10 @@ class Slice:
         camera = self.entry.camera
         upper, lower = (camera.reach_range(self.low, self.high, border) for border in (row, row + 1))
         nearest, farthest = self.depth((ends.near[0], ends.far[1]))
-        low = greatest(self.scale_at(row)[0], camera.focal_px / farthest)
-        high = least(self.scale_at(row + 1)[1], camera.focal_px / nearest)
-        low = greatest(low, camera.focal_px * upper[0].min(lower[0]) / ends.far[1])
-        high = least(high, camera.focal_px * upper[1].max(lower[1]) / ends.near[0])
+        low = greatest(self.scale_at(row)[0], camera.focal_u_px / farthest)
+        high = least(self.scale_at(row + 1)[1], camera.focal_u_px / nearest)
+        low = greatest(low, camera.focal_u_px * upper[0].min(lower[0]) / ends.far[1])
+        high = least(high, camera.focal_u_px * upper[1].max(lower[1]) / ends.near[0])
         return None if low > high else (low, high)
 
     def scales_crossed_in(self, row: int, ends: Ends) -> BallInterval | None:
@@ -228,12 +236,12 @@ class Slice:
         (near_low, _), (_, far_high) = rows
         if not (near_low > row and far_high < row + 1):
             return None
-        focal_px = self.entry.camera.focal_px
+        focal_u_px = self.entry.camera.focal_u_px
         start, stop = self.scale_at(row)[1], self.scale_at(row + 1)[0]
         if not far_high <= row:
-            start = start.max(focal_px / self.depth(ends.far)[0])
+            start = start.max(focal_u_px / self.depth(ends.far)[0])
         if not near_low >= row + 1:
-            stop = stop.min(focal_px / self.depth(ends.near)[1])
+            stop = stop.min(focal_u_px / self.depth(ends.near)[1])
         return start, stop
 
 

@@ -63,11 +63,11 @@ def _check_entry(scene: Scene, camera: BallCamera, tables: FilterTables, row: in
     lower, upper = np.maximum(lower, scene.domain.lower).tolist(), np.minimum(upper, scene.domain.upper).tolist()
     reference_row = float(tables.reference_row[row, place])
     sine, cosine = camera.turn(lower[0])
-    below_horizon = arb(reference_row) - camera.v0 + camera.focal_px * sine / cosine
+    below_horizon = arb(reference_row) - camera.v0 + camera.focal_v_px * sine / cosine
     where = entry_at(tables, row, place)
     demand(bool(below_horizon >= BELOW_HORIZON_PX), "an entry's reference_row is not certainly below the horizon of its states", *where)
     fall = camera.fall_range(lower[0], upper[0], reference_row)
     step = arb(float(largest_steps(scene, np.array([[lower[1], upper[1]]]))[0]))
-    slowest, fastest = camera.focal_px * fall[0] / arb(upper[2]) - step, camera.focal_px * fall[1] / arb(lower[2]) + step
+    slowest, fastest = camera.focal_u_px * fall[0] / arb(upper[2]) - step, camera.focal_u_px * fall[1] / arb(lower[2]) + step
     binds = slowest <= float(tables.line_lower[row, place, 2]) and fastest >= float(tables.line_upper[row, place, 2])
     demand(binds, "an entry's scales reach beyond those of its states by more than a step", *where)

@@ -114,8 +114,8 @@ class _CellProver:
     def _scales_cover(self, theta: tuple[float, float], row: float, entries: NDArray[np.int64]) -> bool:
         """True if every g at `row` that theta and the cell's altitudes allow lies in an entry's bin."""
         fall = self.camera.fall_range(*theta, row)
-        lowest = self.camera.focal_px * fall[0] / arb(self.claim.upper[2])
-        highest = self.camera.focal_px * fall[1] / arb(self.claim.lower[2])
+        lowest = self.camera.focal_u_px * fall[0] / arb(self.claim.upper[2])
+        highest = self.camera.focal_u_px * fall[1] / arb(self.claim.lower[2])
         if not lowest > 0:
             return False
         reached = lowest
@@ -135,7 +135,7 @@ class _CellProver:
         return middle, float((self.claim.lower[2] + self.claim.upper[2]) / 2)
 
     def _scale(self, theta: float, y: float, row: float) -> arb:
-        return self.camera.focal_px * self.camera.ray(theta, row)[0] / arb(y)
+        return self.camera.focal_u_px * self.camera.ray(theta, row)[0] / arb(y)
 
     def _prove_entry(self, number: int) -> None:
         """The state box, O and K of one entry."""

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 from flint import arb, ctx  # pyright: ignore[reportMissingModuleSource]
 
-from build_model.verify.ball_camera import PRECISION_BITS
+from build_model.verify.ball_camera import PRECISION_BITS, focal_lengths
 from build_model.window import Window
 from runtime.scene import Scene
 
@@ -18,26 +18,26 @@ CALIBRATION_PARTS = 16
 def displacement_px(scene: Scene, window: Window) -> float:
     """Bound on the shift, px in the sup norm, of a marking's point in view, by any camera within the scene's calibration.
 
-    A ray (a, b, 1), a = (u - u0)/F, b = (v - v0)/F, is yawed by psi, then rolled by rho, each within its plus-minus:
+    A ray (a, b, 1), a = (u - u0)/F_u, b = (v - v0)/F_v, is yawed by psi, then rolled by rho, each within its plus-minus:
 
         D = a sin(psi) + cos(psi)    a' - a = -sin(psi) (1 + a^2)/D      b' - b = b (1 - D)/D
         a'' - a' = a' (cos(rho) - 1) - b' sin(rho)                       b'' - b' = a' sin(rho) + b' (cos(rho) - 1)
 
-    and then the focal length F is off by a share and the principal point by some px. Points in view lie in the spatial masks' window;
+    and then F_u and F_v are off by one share and the principal point by some px. Points in view lie in the spatial masks' window;
     where it reaches the frame's border, up to `line_px` beyond count too, since the shift can bring them into view.
     """
     if scene.calibration.exact:
         return 0.0
     with ctx.workprec(PRECISION_BITS):
         off, camera = scene.calibration, scene.camera
-        focal = arb(camera.focal_length_m) / arb(camera.pixel_pitch_m)
+        focal_u, focal_v = focal_lengths(camera)
         line_px, (height, width) = scene.tolerance.line_px, camera.shape
         left = window.left - line_px * (window.left == 0)
         right = window.right + line_px * (window.right == width)
         top = window.top - line_px * (window.top == 0)
         bottom = window.bottom + line_px * (window.bottom == height)
-        across = [(side - arb(camera.u0)) / focal for side in _parts(left, right)]
-        down = [(side - arb(camera.v0)) / focal for side in _parts(top, bottom)]
+        across = [(side - arb(camera.u0)) / focal_u for side in _parts(left, right)]
+        down = [(side - arb(camera.v0)) / focal_v for side in _parts(top, bottom)]
         yaw, roll = _sine_and_cosine(off.yaw_rad), _sine_and_cosine(off.roll_rad)
         largest = arb(0)
         for a, b in itertools.product(across, down):
@@ -51,7 +51,7 @@ def displacement_px(scene: Scene, window: Window) -> float:
                 shift_b + yawed_a * roll[0] + yawed_b * (roll[1] - 1),
             )
             share = arb(0, off.focal_relative)
-            for ray, shift in ((a, shift_a), (b, shift_b)):
+            for focal, ray, shift in ((focal_u, a, shift_a), (focal_v, b, shift_b)):
                 largest = largest.max(abs(focal * (shift + share * (ray + shift)) + arb(0, off.principal_px)).upper())
         return float(np.nextafter(float(largest.upper()), np.inf))
 

@@ -241,6 +241,6 @@ def _states(part: Slice) -> Iterator[tuple[float, ...]]:
 def _point(entry: BallEntry, state: tuple[float, ...]) -> Slice:
     """One state as a slice: every range is that of a single number."""
     theta, x, y, z = state[0], *(arb(value) for value in state[1:])
-    scale = entry.camera.focal_px * entry.camera.ray(theta, entry.reference_row)[0] / y
+    scale = entry.camera.focal_u_px * entry.camera.ray(theta, entry.reference_row)[0] / y
     single = replace(entry, theta=(theta, theta), x=(x, x), y=(y, y), z=(z, z), scale=(scale, scale))
     return Slice(single, theta, theta)

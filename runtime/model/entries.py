@@ -1,7 +1,7 @@
 """The bank of a loaded model, as the runtime needs it: every entry as a set of states, and every cell's spatial mask.
 
 What the loader guarantees, whoever wrote the file, of every set that `Entries.sets` gives; H is the frame's height, v_h(theta) =
-v0 - F tan(theta) the horizon, (theta, x, y, z) a state of the set's box, all numbers float64:
+v0 - F_v tan(theta) the horizon, (theta, x, y, z) a state of the set's box, all numbers float64:
 
 1. All bounds are finite, and each lower one is at most its upper one. theta, x, y and z lie in the domain's hull, and an axis of width 0 is
    its value; so what `runtime.scene` demands of all states of the hull holds of every state of the box: y and the distances of all ends are
@@ -9,7 +9,7 @@ v0 - F tan(theta) the horizon, (theta, x, y, z) a state of the set's box, all nu
 2. The reference row is in the frame or a pixel below it, 0 <= v_ref <= H + 1, and `BELOW_HORIZON_PX` or more below the horizon: v_ref -
    v_h(theta) >= 0.5. So s(theta, t_ref) > 0, and R = s(theta, t) / s(theta, t_ref) = (v - v_h) / (v_ref - v_h), at a row v below the
    horizon, lies between 0 and 1 + 2 |v - v_ref|.
-3. The scale lies in the range of F s(theta, t_ref) / y over the box, up to the share `OUTWARD_RELATIVE` of it: above 0, and no smaller or
+3. The scale lies in the range of F_u s(theta, t_ref) / y over the box, up to the share `OUTWARD_RELATIVE` of it: above 0, and no smaller or
    larger than the box allows.
 
 Padding, and entries whose box of states and scale contradict each other by more than float64's error, are in no such set: they have no
@@ -140,7 +140,7 @@ def _check_states(scene: Scene, states: NDArray[np.float32], name: str) -> None:
 def _check_reference_rows(scene: Scene, rows: NDArray[np.float64], theta: NDArray[np.float64], name: str) -> None:
     """Reference rows are near the frame, and below the horizon of the smallest of `theta`, (entries, 2). Raises `ModelError`."""
     camera, lowest = scene.camera, scene.camera.height + ROWS_BELOW_FRAME
-    horizon = camera.v0 - camera.focal_px * np.tan(theta[:, 0])
+    horizon = camera.v0 - camera.focal_v_px * np.tan(theta[:, 0])
     for wrong, limits in (
         ((rows < 0) | (rows > lowest), f"0 to {lowest} are taken"),
         (rows < horizon + BELOW_HORIZON_PX, "which is not below the horizon of all its states"),
@@ -155,7 +155,7 @@ def _contracted_scales(scene: Scene, sets: StateSet, name: str) -> NDArray[np.fl
     The file's scales may exceed that range by a step of their bins. Raises `ModelError` if they exceed it by more, or are not ordered
     above 0.
     """
-    low, high = (scene.camera.focal_px * side for side in sets.reference_range)
+    low, high = (scene.camera.focal_u_px * side for side in sets.reference_range)
     low, high = low / sets.y[:, 1], high / sets.y[:, 0]
     step = largest_steps(scene, sets.x)
     slow, fast = sets.scale.T

@@ -86,11 +86,11 @@ def _columns(scene: Scene, sets: StateSet, ratio: Interval, margin_px: Floats) -
 def _ends(scene: Scene, sets: StateSet) -> tuple[Interval, Interval]:
     """Ranges of the rows of each marking's near and far end, (markings, sets) each; equal distances are computed once.
 
-    v - v0 = F tan(beta - theta), so an error of an angle grows by 1 + tan^2: that of rounding, of the altitude that a scale stands for, and
-    of the distance as a sum of coordinates.
+    v - v0 = F_v tan(beta - theta), so an error of an angle grows by 1 + tan^2: that of rounding, of the altitude that a scale stands for,
+    and of the distance as a sum of coordinates.
     """
     distances = scene.runway.distances_z_m
-    focal, v0 = scene.camera.focal_px, scene.camera.v0
+    focal, v0 = scene.camera.focal_v_px, scene.camera.v0
     along = distances[:, None]
     angle = sets.condition + np.abs(along) / (sets.z[:, 0] + along)
     low, high = (side.T for side in end_rows(scene.camera, sets, distances))

@@ -11,7 +11,7 @@ from runtime.state_set import StateSet, scale_ratio, tangent_of_row
 
 
 def ground_distances(camera: Camera, sets: StateSet, nearest_row: Floats, farthest_row: Floats) -> Interval:
-    """Lower bound on the distance d = F (cos(theta) - t sin(theta)) / (scale R) of the ground at some rows, and upper bound at others, m.
+    """Lower bound on the distance d = F_u (cos(theta) - t sin(theta)) / (scale R) of the ground at some rows, and upper bound at others, m.
 
     Rows are (rows, sets) each, and so are the bounds. There is no upper one where some state of the set may see the horizon.
     """
@@ -25,7 +25,7 @@ def ground_distances(camera: Camera, sets: StateSet, nearest_row: Floats, farthe
     far = raised(cosine_low - sine_low * tangent[1], tilt[1])
     seen = slow > 0
     nearest, farthest = np.maximum(near, 0) / fast, np.maximum(far, 0) / np.where(seen, slow, 1.0)
-    return camera.focal_px * nearest, camera.focal_px * np.where(seen, farthest, np.inf)
+    return camera.focal_u_px * nearest, camera.focal_u_px * np.where(seen, farthest, np.inf)
 
 
 def z_of_rows(camera: Camera, sets: StateSet, lowest: Floats, not_below: Floats, highest: Floats, not_above: Floats) -> Interval:

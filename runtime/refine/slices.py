@@ -42,7 +42,7 @@ def covering(camera: Camera, box: Box, row: float) -> StateSet:
 def tangents_below_horizon(camera: Camera, tangent: Floats, theta_low: float) -> Floats:
     """The tangents of rows, (n,), or of a lower one that is `BELOW_HORIZON_PX` below the horizon of every theta from `theta_low` on."""
     cosine, sine = cosine_and_sine(np.array([[theta_low]]))
-    return np.maximum(tangent, BELOW_HORIZON_PX / camera.focal_px - sine[0, 0] / cosine[0, 0])
+    return np.maximum(tangent, BELOW_HORIZON_PX / camera.focal_v_px - sine[0, 0] / cosine[0, 0])
 
 
 def rereferenced(sets: StateSet, tangent: Floats) -> StateSet:

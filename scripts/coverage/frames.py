@@ -125,8 +125,8 @@ def must_light(rng: Rng, picture: Picture) -> Pixels:
     stage, state = picture.stage, picture.states[0]
     bank = bank_of(stage.path, int(rng.choice(stage.cells_of(state))))
     theta, x, y, z = state.floats
-    tangent = (bank.lines.reference_row - stage.scene.camera.v0) / stage.scene.camera.focal_px
-    scale = stage.scene.camera.focal_px * (np.cos(theta) * tangent + np.sin(theta)) / y
+    tangent = (bank.lines.reference_row - stage.scene.camera.v0) / stage.scene.camera.focal_v_px
+    scale = stage.scene.camera.focal_u_px * (np.cos(theta) * tangent + np.sin(theta)) / y
     line = np.stack([np.full_like(scale, theta), np.full_like(scale, x), scale, np.full_like(scale, z)], axis=-1)
     holding = np.flatnonzero(((bank.lines.lower - 1e-9 <= line) & (line <= bank.lines.upper + 1e-9)).all(axis=1))
     must, runs = np.zeros_like(picture.runway), bank.must_light

@@ -89,7 +89,8 @@ def camera_off(rng: Rng, stage: Stage) -> RationalView:
         view,
         roll=tangent_within(roll, -off.roll_rad, off.roll_rad),
         yaw=tangent_within(yaw, -off.yaw_rad, off.yaw_rad),
-        focal=view.focal * (1 + Fraction(zoom)),
+        focal_u=view.focal_u * (1 + Fraction(zoom)),
+        focal_v=view.focal_v * (1 + Fraction(zoom)),
         u0=view.u0 + Fraction(right),
         v0=view.v0 + Fraction(down),
     )

@@ -172,8 +172,8 @@ def on_pixel_borders(rng: Rng, stage: Stage) -> RationalState:
 def solved_for_border(rng: Rng, stage: Stage, state: RationalState) -> RationalState | None:
     """The state with y or z, or both, changed so that a point of a marking comes to lie on the closest border of pixels.
 
-    With tau = (v - v0)/F and s = tau cos(theta) + sin(theta), a point at depth Z and row v has y = Z s, d = Z (cos(theta) - tau sin(theta))
-    and u = u0 + F (p_x - x)/Z; a marking's line crosses row v at u = u0 + F (p_x - x) s/y.
+    With tau = (v - v0)/F_v and s = tau cos(theta) + sin(theta), a point at depth Z and row v has y = Z s,
+    d = Z (cos(theta) - tau sin(theta)) and u = u0 + F_u (p_x - x)/Z; a marking's line crosses row v at u = u0 + F_u (p_x - x) s/y.
     """
     view = stage.view
     stripe = view.stripes[rng.integers(len(view.stripes))]
@@ -181,14 +181,14 @@ def solved_for_border(rng: Rng, stage: Stage, state: RationalState) -> RationalS
     u, v = view.project(state, stripe.x, p_z)
     column, row = Fraction(round(u)), Fraction(round(v))
     cosine, sine = turn(state.tangent)
-    tau = (row - view.v0) / view.focal
+    tau = (row - view.v0) / view.focal_v
     steepness, reach = tau * cosine + sine, cosine - tau * sine
     kind = rng.choice(["row", "column", "corner", "line"])
     if steepness <= 0 or (kind != "row" and column == view.u0):
         return None
     if kind == "row":
         return replace(state, z=state.y * reach / steepness - p_z)
-    depth = view.focal * (stripe.x - state.x) / (column - view.u0)
+    depth = view.focal_u * (stripe.x - state.x) / (column - view.u0)
     if kind == "column":
         return replace(state, z=(depth - state.y * sine) / cosine - p_z)
     if kind == "corner":

@@ -104,7 +104,7 @@ def end_rates(sight: Sight) -> Floats:
     for rows, distances in zip(sight.rows, sight.ahead, strict=True):
         for row, d in zip(reversed(rows), distances, strict=True):
             if -1 <= row <= outlook.camera.height + 1:
-                steepness = outlook.camera.focal_px / math.cos(math.atan2(outlook.y, d) - outlook.theta) ** 2
+                steepness = outlook.camera.focal_v_px / math.cos(math.atan2(outlook.y, d) - outlook.theta) ** 2
                 rates = np.maximum(rates, steepness * np.array([1.0, d, outlook.y]) / [1.0, *[d**2 + outlook.y**2] * 2])
     return rates
 
@@ -342,6 +342,7 @@ def kinds_of(scene: Scene, setting: Setting) -> list[str]:
         "frame below 10,000 px": pixels < 1e4,
         "frame above 1,000,000 px": pixels > 1e6,
         "principal point out of the frame": not (0 <= camera.u0 <= camera.width and 0 <= camera.v0 <= camera.height),
+        "pixels not square": camera.focal_u_px != camera.focal_v_px,
         f"line_px {scene.tolerance.line_px}": scene.tolerance.line_px > 0,
         "camera off": not scene.calibration.exact,
     }

@@ -51,7 +51,7 @@ class Outlook:
 
     def row(self, angle: float) -> float:
         """The row of a psi."""
-        return self.camera.v0 + self.camera.focal_px * math.tan(angle - self.theta)
+        return self.camera.v0 + self.camera.focal_v_px * math.tan(angle - self.theta)
 
     def distance(self, row: float) -> float:
         """How far ahead the ground of a row lies, m."""
@@ -105,6 +105,8 @@ class Sight:
         return np.array([[self.outlook.distance(near), self.outlook.distance(far)] for far, near in self.rows])
 
 
+ASPECTS = (0.9, 1.1)
+"""F_u in units of F_v, where pixels are not square."""
 Place = Callable[[Rng, Camera, int], Sight]
 
 
@@ -115,7 +117,7 @@ def log_uniform(rng: Rng, low: float, high: float) -> float:
 
 def angle_in_image(camera: Camera, row: float) -> float:
     """The angle of a row below the camera's axis, rad."""
-    return math.atan((row - camera.v0) / camera.focal_px)
+    return math.atan((row - camera.v0) / camera.focal_v_px)
 
 
 # --- places ---
@@ -261,10 +263,13 @@ PLACES: dict[str, tuple[float, Place]] = {
 
 
 def draw_camera(rng: Rng) -> Camera:
-    """A frame of any size, a lens of any length, a principal point in the middle, off it, or out of the frame."""
+    """A frame of any size, a lens of any length, a principal point in the middle, off it, or out of the frame, pixels square or not."""
     width, height = (round(log_uniform(rng, *sides)) for sides in (WIDTH_PX, HEIGHT_PX))
     pitch = log_uniform(rng, 1e-6, 1e-4)
     camera = Camera(width, height, width * log_uniform(rng, *FOCAL_WIDTHS) * pitch, pitch)
+    if rng.random() < 0.4:
+        focal_v_px = camera.focal_v_px
+        camera = Camera(width, height, focal_px=(focal_v_px * log_uniform(rng, *ASPECTS), focal_v_px))
     off = rng.choice([0.0, 0.3, 1.5], p=[0.5, 0.35, 0.15])
     if off == 0.0:
         return camera

@@ -21,7 +21,7 @@ from runtime.scene import Calibration, Scene
 
 EstimatorOf = Callable[..., Estimator]
 DENSITIES = (0.0, 0.01, 0.05, 0.2, 0.6, 1.0)
-EXACT = ("paper", "three markings", "unlike markings", "cut left", "cut right", "cut below", "free x", "one cell")
+EXACT = ("paper", "three markings", "unlike markings", "cut left", "cut right", "cut below", "free x", "one cell", "oblong pixels")
 TOLERANT = (
     "tolerant",
     "tolerant, cut left",
@@ -178,9 +178,9 @@ def seen_by(scene: Scene, state: Floats, off: Calibration, shares: Floats) -> Fr
     camera = scene.camera
     centre = np.array([camera.u0, camera.v0])
     ends = project(scene, state)
-    rays = np.concatenate([(ends - centre) / camera.focal_px, np.ones((*ends.shape[:-1], 1))], axis=-1)
+    rays = np.concatenate([(ends - centre) / camera.focal_v_px, np.ones((*ends.shape[:-1], 1))], axis=-1)
     turned = rays @ (rotation(2, shares[1] * off.roll_rad) @ rotation(1, shares[0] * off.yaw_rad)).T
-    zoom = camera.focal_px * (1 + shares[2] * off.focal_relative)
+    zoom = camera.focal_v_px * (1 + shares[2] * off.focal_relative)
     return image_of_ends(centre + shares[3:] * off.principal_px + zoom * turned[..., :2] / turned[..., 2:], camera.shape)
 
 
