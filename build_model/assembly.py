@@ -7,10 +7,12 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from build_model.filter_tables import FilterTables
+from build_model.filter_tables import FilterTables, WindowTables
 from build_model.hough_bank import CellBank
 from build_model.partition import partition
 from build_model.run_table import run_table, spatial_runs
+from build_model.window_bank import CellWindows
+from build_model.window_table import window_of_spans, window_table
 from runtime.model.format import PADDING_SIZE
 from runtime.rounding import float32_above, float32_below
 from runtime.scene import Scene
@@ -19,8 +21,41 @@ ROW_COST, SECOND_REDUCTION_COST = 8, 2000
 """What a row costs beside its entries, and what it costs to gather rows by cell and reduce them again, in entries scored and reduced."""
 
 
-def assemble(scene: Scene, banks: Sequence[CellBank]) -> FilterTables:
+def assemble(scene: Scene, banks: Sequence[CellBank] | Sequence[CellWindows]) -> FilterTables | WindowTables:
     """Lays out the banks of all cells, in the order of the partition."""
+    windowed = [bank for bank in banks if isinstance(bank, CellWindows)]
+    return _of_windows(scene, windowed) if windowed else _of_masks(scene, [bank for bank in banks if isinstance(bank, CellBank)])
+
+
+def _of_windows(scene: Scene, banks: Sequence[CellWindows]) -> WindowTables:
+    """A row of the tables is a group."""
+    window, cells = window_of_spans([bank.spans for bank in banks]), partition(scene)
+    table, parts = window_table(banks, window), banks[0].exists.shape[1]
+    exists = np.concatenate([bank.exists for bank in banks])
+    sizes = np.concatenate([bank.windows.sizes for bank in banks]).reshape(-1, parts)
+
+    def of_lines(name: str) -> NDArray[np.float64]:
+        values = np.concatenate([getattr(bank.lines, name) for bank in banks])
+        return values.reshape(-1, parts, *values.shape[1:])
+
+    return WindowTables(
+        window=window,
+        cells=cells,
+        cell_lower=float32_below(cells.lower),
+        cell_upper=float32_above(cells.upper),
+        row_cell=np.repeat(np.arange(len(banks), dtype=np.int32), [len(bank.exists) for bank in banks]),
+        must_light_size=np.where(exists, sizes, PADDING_SIZE).astype(np.int32),
+        state_lower=np.concatenate([bank.state_lower for bank in banks]),
+        state_upper=np.concatenate([bank.state_upper for bank in banks]),
+        line_lower=of_lines("lower"),
+        line_upper=of_lines("upper"),
+        reference_row=of_lines("reference_row"),
+        windows=table,
+    )
+
+
+def _of_masks(scene: Scene, banks: Sequence[CellBank]) -> FilterTables:
+    """A cell's entries fill rows of one width."""
     window = banks[0].window
     for bank in banks[1:]:
         window = window.union(bank.window)

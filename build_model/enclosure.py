@@ -62,15 +62,22 @@ def columns_that_may_be_lit(scene: Scene, sets: StateSet, beyond_px: int = 0) ->
     return np.stack(firsts, axis=1), np.stack(lasts, axis=1)
 
 
-def rows_that_must_be_crossed(scene: Scene, sets: StateSet) -> NDArray[np.bool_]:
-    """True for the rows of the frame whose inside each marking meets in all states of a set, (sets, markings, rows)."""
-    camera, top = scene.camera, np.arange(scene.camera.height, dtype=np.float64)
-    crossed = []
-    for near, far in scene.runway.ends_z_m:
-        start = np.maximum(top, above(end_rows(camera, sets, far)[1])[:, None])
-        stop = np.minimum(top + 1, below(end_rows(camera, sets, near)[0])[:, None])
-        crossed.append(start < stop)
-    return np.stack(crossed, axis=1)
+def columns_at_borders(scene: Scene, sets: StateSet) -> tuple[Columns, NDArray[np.bool_]]:
+    """Columns of the pixels in whose closed columns a marking can meet the border v = r above row r, for r = 1 to height - 1, and whether
+    the markings of all states of a set cross it, (sets, markings, height - 1) each.
+    """
+    camera, row = scene.camera, np.arange(1, scene.camera.height, dtype=np.float64)
+    tangent = tangent_of_row(camera, np.broadcast_to(row, (len(sets), len(row))))
+    scale = scale_between(camera, sets, tangent, tangent)
+    firsts, lasts, crossed = [], [], []
+    for marking in scene.runway.markings:
+        near, far = marking.ends_z_m
+        lowest, highest = above(end_rows(camera, sets, far)[1]), below(end_rows(camera, sets, near)[0])
+        low, high = column_range(camera, marking.x_m - sets.x[:, ::-1], scale)
+        firsts.append(first_touched(low))
+        lasts.append(last_touched(high))
+        crossed.append((row > lowest[:, None]) & (row < highest[:, None]))
+    return (np.stack(firsts, axis=1), np.stack(lasts, axis=1)), np.stack(crossed, axis=1)
 
 
 def columns_that_must_be_lit(scene: Scene, sets: StateSet) -> Columns:

@@ -1,7 +1,8 @@
 """The tables of NN_F: what its graph is made of, and what a verifier reads back from the graph. Data alone: `assembly` makes them.
 
-A cell's bank is laid out in rows of one width, ready for the static graph of `build_model.filter_graph`: a row for a cell where the cells
-have about as many entries each, several rows for the larger ones where they have not.
+A cell's bank is laid out in rows of one width, ready for a static graph. In a bank of masks (`build_model.filter_graph`) it is a row for a
+cell where the cells have about as many entries each, several rows for the larger ones where they have not; in one of windows
+(`build_model.window_graph`) a row is a group of entries.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 
 from build_model.partition import Partition
 from build_model.window import Window
+from runtime.model.format import PADDING_SIZE
 
 
 @dataclass(frozen=True)
@@ -53,8 +55,32 @@ class SpatialRuns:
 
 
 @dataclass(frozen=True)
-class FilterTables:
-    """Constants of NN_F. A cell's entries fill one row or several, (rows, width), the last of them padded."""
+class WindowTable:
+    """Windows as look-ups into the sums of the frame along its rows, (columns + 1, rows) of the window, flat, under a column of zeros.
+
+    A window is lit where the sum at its end exceeds that at its start. Unused ones are (0, 0), and never lit.
+    """
+
+    gate_size: NDArray[np.int32]
+    """Number of each group's windows, (rows,)."""
+    gate_start: NDArray[np.int32]
+    gate_stop: NDArray[np.int32]
+    """(rows, windows)."""
+    start: NDArray[np.int32]
+    """Of the entries' windows, (rows, width, windows)."""
+    columns: NDArray[np.uint8]
+    """How many columns each has, as `start`: an end lies as many times the window's rows behind."""
+    span_first: NDArray[np.int16]
+    span_stop: NDArray[np.int16]
+    """S: each marking's first column in each row, and the one behind its last, (cells, markings, rows of the window).
+
+    Where there is none, the first is behind the window's last and the other 0, so that neither is an extreme among cells that have some.
+    """
+
+
+@dataclass(frozen=True)
+class BankTables:
+    """What the tables of both kinds of bank have. A cell's entries fill one row or several, (rows, width), with padding among them."""
 
     window: Window
     cells: Partition
@@ -63,10 +89,8 @@ class FilterTables:
     """Each cell, rounded outward, (cells, 4)."""
     row_cell: NDArray[np.int32]
     """The cell of each row, (rows,), ascending."""
-    runs: RunTable
-    spatial_runs: SpatialRuns
     must_light_size: NDArray[np.int32]
-    """|K_ij|, (rows, width); `PADDING_SIZE` in the padding."""
+    """|K_ij|, or the number of an entry's windows, (rows, width); `PADDING_SIZE` in the padding."""
     state_lower: NDArray[np.float32]
     state_upper: NDArray[np.float32]
     """Each entry in state coordinates, (rows, width, 4)."""
@@ -84,5 +108,30 @@ class FilterTables:
 
     @property
     def smallest_must_light(self) -> int:
-        """Smallest |K_ij| of all entries."""
+        """Smallest |K_ij|, or number of windows, of all entries."""
         return int(self.must_light_size.min())
+
+    @property
+    def entries(self) -> int:
+        """Number of all entries."""
+        return int((self.must_light_size != PADDING_SIZE).sum())
+
+
+@dataclass(frozen=True)
+class FilterTables(BankTables):
+    """Constants of an NN_F of masks."""
+
+    runs: RunTable
+    spatial_runs: SpatialRuns
+
+
+@dataclass(frozen=True)
+class WindowTables(BankTables):
+    """Constants of an NN_F of windows. Each row is a group."""
+
+    windows: WindowTable
+
+    @property
+    def smallest_must_light(self) -> int:
+        """Smallest number of windows of all entries and groups."""
+        return min(super().smallest_must_light, int(self.windows.gate_size.min()))

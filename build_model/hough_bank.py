@@ -28,7 +28,7 @@ from build_model.spatial_filter import reference_row, sliced, spatial_filter
 from build_model.window import Bits, Window
 from runtime.model.limits import SCALE_STEP, SMALLEST_LEVER_M
 from runtime.rounding import float32_above, float32_below, inverted
-from runtime.scene import STATE_NAMES, Scene, SceneError
+from runtime.scene import STATE_NAMES, Bank, Scene, SceneError
 from runtime.state_set import StateSet, contract, scale_range, tangent_of_row
 
 BATCH_BYTES = 2**26
@@ -57,9 +57,20 @@ class CellBank:
         return len(self.lines)
 
     @property
+    def spatial_pixels(self) -> int:
+        """Pixels of S."""
+        return int(self.spatial.sizes(1)[0])
+
+    @property
     def must_light_sizes(self) -> NDArray[np.int64]:
         """|K_ij| of every entry, (entries,)."""
         return self.must_light.sizes(len(self))
+
+
+def mask_bank(scene: Scene) -> Bank:
+    """The scene's bank, which is one of masks."""
+    assert isinstance(scene.bank, Bank)
+    return scene.bank
 
 
 def line_boxes(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> LineBoxes:
@@ -87,7 +98,7 @@ def _columns_of_boxes(
     scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], float, NDArray[np.float64], NDArray[np.float64]]]:
     """For each bin of theta and z of a cell: both, (2,) each, the reference row, the scale's range there, (2,), and bins of x (bins, 2)."""
-    bank = scene.bank
+    bank = mask_bank(scene)
     for theta, z in itertools.product(sliced(lower[0], upper[0], bank.pitch_bins), sliced(lower[3], upper[3], bank.distance_bins)):
         low, high = lower.copy(), upper.copy()
         (low[0], high[0]), (low[3], high[3]) = theta, z
@@ -102,7 +113,7 @@ def _scale_borders(scene: Scene, x: NDArray[np.float64], scale: NDArray[np.float
     first and the last step that cover `scale` (2,), above 0; (bins,) each.
     """
     lever_m = np.maximum(np.abs(scene.runway.x_m[:, None] - x[:, None, :]).max(axis=(1, 2)), SMALLEST_LEVER_M)
-    step = np.maximum(np.floor(scene.bank.column_px / lever_m / SCALE_STEP), 1) * SCALE_STEP
+    step = np.maximum(np.floor(mask_bank(scene).column_px / lever_m / SCALE_STEP), 1) * SCALE_STEP
     return step, np.floor(scale[0] / step), np.ceil(scale[1] / step)
 
 

@@ -267,7 +267,8 @@ def _pair(key: str, value: Any) -> tuple[int, int]:
 def _numbers(key: str, value: Any, count: int | None = None) -> list[float]:
     """The numbers of a matrix: OpenCV's and ROS's table with `data`, or a list, of rows too."""
     values = value.get("data") if isinstance(value, dict) else value
-    _demand(isinstance(values, list | str), key, "nothing" if values is None else values, "give a row of numbers")
+    if not isinstance(values, list | str):
+        raise CalibrationFileError(f"{key}: found {'nothing' if values is None else values!s:.120}; give a row of numbers")
     flat = [number for item in ([values] if isinstance(values, str) else values) for number in (item if isinstance(item, list) else [item])]
     _demand(count is None or len(flat) == count, key, f"{len(flat)} numbers", f"give {count}")
     return [_number(key, number) for number in flat]

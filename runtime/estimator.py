@@ -24,9 +24,9 @@ from numpy.typing import ArrayLike, NDArray
 from runtime.assumptions import assumptions, prior_assumption
 from runtime.estimate import Box, Estimate, FrameError, Outcome
 from runtime.model.entries import Entries
-from runtime.model.format import BOX_TENSORS, MASK_TENSORS, OUTPUTS, ModelError
+from runtime.model.format import BOX_TENSORS, MASK_TENSORS, OVERFLOW, SPAN_TENSORS, ModelError
 from runtime.model.model_file import ModelFile, packaged_model, parse_model, read_model
-from runtime.model.session import check_interface, open_session, reason_of
+from runtime.model.session import check_interface, open_session, outputs_of, reason_of
 from runtime.refine.refiner import Refiner
 from runtime.refine.regions import hulls, regions_of
 from runtime.refine.slices import covering, within
@@ -52,6 +52,8 @@ class Found:
     cell_upper: NDArray[np.float32]
     filtered: NDArray[np.uint8]
     network_state: NDArray[np.float64]
+    overflow: bool
+    """More groups of a bank of windows passed than there are places: the others stand for all of their entries."""
 
 
 class Estimator:
@@ -66,8 +68,10 @@ class Estimator:
             raise ModelError(f"{name}: the scene in its metadata is unusable ({error})") from error
         self._budgets = self._checked_budgets(name, missed_budget, extra_budget)
         self._entries = Entries.of(self.scene, model.tensors, name)
-        if self.metadata["smallest_must_light"] != model.tensors["must_light_size"].min():
+        sizes = [model.tensors[label].min() for label in ("must_light_size", "gate_size") if label in model.tensors]
+        if self.metadata["smallest_must_light"] != min(sizes):
             raise ModelError(f"{name}: its metadata misstate the smallest |K| of its entries; export it again with export-model")
+        self._outputs = outputs_of(self.scene)
         self._session = open_session(model.content, name, threads)
         check_interface(self._session, self.scene, model.tensors["must_light_size"].shape, name)
         self.domain = Box(self.scene.domain.lower, self.scene.domain.upper)  # the hull of the cells
@@ -119,7 +123,7 @@ class Estimator:
         content = read_model(source)
         if sha256 is not None and sha256.lower() != (digest := hashlib.sha256(content).hexdigest()):
             raise ModelError(f"{source}: sha256 is {digest}, the caller trusts {sha256}; take the file from its source again")
-        model = parse_model(content, str(source), BOX_TENSORS + MASK_TENSORS)
+        model = parse_model(content, str(source), BOX_TENSORS, (MASK_TENSORS, SPAN_TENSORS))
         return cls(model, str(source), threads, missed_budget, extra_budget)
 
     def run(self, frame: NDArray) -> dict[str, Any]:
@@ -132,7 +136,7 @@ class Estimator:
         Raises `ModelError` if that fails, which it may for a file that no `sha256` vouches for.
         """
         try:
-            return dict(zip(OUTPUTS, self._session.run(OUTPUTS, {"frame": pixels, **self._budgets}), strict=True))
+            return dict(zip(self._outputs, self._session.run(self._outputs, {"frame": pixels, **self._budgets}), strict=True))
         except Exception as error:  # onnxruntime raises classes of its own that share only this one
             raise ModelError(f"{self._name}: onnxruntime cannot run it ({reason_of(error)}); export it again") from error
 
@@ -157,9 +161,11 @@ class Estimator:
     def find(self, frame: NDArray) -> Found:
         """What the model says of a frame. Raises `FrameError` as `estimate` does."""
         pixels = self._checked_frame(frame)
-        cell, support, mismatch, passes, lower, upper, filtered, network_state = self.run_unchecked(pixels).values()
+        outputs = self.run_unchecked(pixels)
+        overflow = bool(outputs.pop(OVERFLOW, False))
+        cell, support, mismatch, passes, lower, upper, filtered, network_state = outputs.values()
         network = np.where(self.scene.domain.fixed, self.domain.lower, network_state)
-        return Found(pixels, int(cell), support, mismatch, passes, lower, upper, filtered, network)
+        return Found(pixels, int(cell), support, mismatch, passes, lower, upper, filtered, network, overflow)
 
     def covering(self, prior: Box) -> StateSet:
         """The part of a box that lies in the domain's hull, as a set of states; no set where there is none."""

@@ -267,11 +267,11 @@ class Bank:
 class WindowedBank:
     """A bank for a whole approach: entries that move the image by tens of px, tested by must-hit windows (`build_model.window_bank`)."""
 
-    set_px: float = 20.0
+    set_px: float = 30.0
     """How far, in px, the states of an entry move the image at most along each of its axes, about; less where the runway has few rows."""
     rows: int = 16
     """Rows of pixels in which an entry has windows, at most."""
-    places: int = 128
+    places: int = 512
     """Groups of entries that a frame opens, at most; what passes beyond these stays whole."""
 
     def __post_init__(self) -> None:

@@ -24,11 +24,12 @@ from numpy.typing import NDArray
 from rich.table import Table
 
 from build_model.export import export_model
+from build_model.hough_bank import mask_bank
 from runtime import Estimator, Scene, terminal
 from runtime.recordings.bench import cluttered_frames, machine
 from runtime.recordings.chart import BLUE, FONT_PT, INK, PALE, RED, new_figure, picture_of, rgb, style_axes, with_own_settings
 from runtime.recordings.draw import Picture, png
-from runtime.scene import Axis, Bank, Domain, EstimatorTraining
+from runtime.scene import Axis, Domain, EstimatorTraining
 from runtime.whole_file import write_whole
 
 CLUTTER = 0.02
@@ -65,7 +66,7 @@ def scenes(paper: Scene) -> list[tuple[str, Scene]]:
     chosen = [("finer", paper)]
     for count, width, pitch_bins, distance_bins in ((6, 0.05, 2, 1), (12, 0.025, 1, 1)):
         domain = Domain(tiled(0.45, count, width), x, tiled(0.75, count, width), tiled(1.55, count, width))
-        bank = Bank(pitch_bins=pitch_bins, distance_bins=distance_bins, column_px=paper.bank.column_px, lateral_px=paper.bank.lateral_px)
+        bank = replace(mask_bank(paper), pitch_bins=pitch_bins, distance_bins=distance_bins)
         chosen.append(("finer", replace(paper, domain=domain, bank=bank)))
     for y, z in (((0.75, 8), (1.55, 9)), ((2.2, 24), (4.5, 24))):
         domain = Domain(tiled(0.4, 3, 0.1), x, tiled(y[0], y[1], 0.1), tiled(z[0], z[1], 0.1))

@@ -25,7 +25,6 @@ Prints each figure and writes the scene file. Exit code 2 if no t of 0 to 2 px w
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -39,9 +38,10 @@ from rich.progress import track
 from rich.table import Table
 from simulate_approach import PAPER_SECONDS, WINDOW_US, Target, Vibration, event_camera, window_truths
 
+from build_model.assembly import assemble
 from build_model.calibration import displacement_px
 from build_model.export import build_banks
-from build_model.window import Window
+from build_model.filter_tables import BankTables
 from runtime import Scene, SceneError, terminal
 from runtime.errors import fail
 from runtime.frames import FrameStream
@@ -89,15 +89,19 @@ def missed_of_flight(scene: Scene, placed: Sequence[Scene], seed: int, seconds: 
 def smallest_must_light(scene: Scene, tolerance: Tolerance) -> int | None:
     """Smallest |K| of the bank, which exceeds the budget; None if no bank of sensible size has entries that strong."""
     try:
-        return min(int(bank.must_light_sizes.min()) for bank in build_banks(replace(scene, tolerance=tolerance)))
+        return _tables(replace(scene, tolerance=tolerance)).smallest_must_light
     except SceneError:
         return None
 
 
 def vibration_shift_px(scene: Scene) -> float:
     """Largest shift of a marking under the vibration, as the build bounds that of a calibration."""
-    window: Window = functools.reduce(Window.union, (bank.window for bank in build_banks(scene)))
-    return displacement_px(replace(scene, calibration=Vibration().calibration(scene.camera.focal_v_px)), window)
+    calibration = Vibration().calibration(scene.camera.focal_v_px)
+    return displacement_px(replace(scene, calibration=calibration), _tables(scene).window)
+
+
+def _tables(scene: Scene) -> BankTables:
+    return assemble(scene, build_banks(scene))
 
 
 def bearable(scene: Scene, budgets: Sequence[int]) -> Iterator[tuple[Tolerance, int | None]]:

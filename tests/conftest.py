@@ -50,13 +50,13 @@ def random_states() -> Callable[[Scene, int, int], NDArray[np.float64]]:
 
 @pytest.fixture(scope="session")
 def model_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """`model_of(name)`: the model of `scenes.SCENES[name]`, exported once for all workers when it is first asked for."""
+    """`model_of(name)`: the model of a scene of `scenes`, exported once for all workers when it is first asked for."""
     own = tmp_path_factory.getbasetemp()
     folder = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "models"
     folder.mkdir(exist_ok=True)
 
     def model(name: str) -> Path:
-        from scenes import SCENES
+        from scenes import SCENES, WINDOWED
 
         from build_model.export import export_model
 
@@ -64,7 +64,7 @@ def model_of(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
         with path.with_suffix(".lock").open("w") as lock:
             fcntl.flock(lock, fcntl.LOCK_EX)
             if not path.exists():
-                export_model(SCENES[name], path, seed=1)
+                export_model((SCENES | WINDOWED)[name], path, seed=1)
         return path
 
     return model

@@ -12,7 +12,21 @@ from numpy.typing import NDArray
 
 from build_model.spatial_filter import reference_row
 from runtime.camera import ground_scale
-from runtime.scene import Axis, Bank, Calibration, Camera, Domain, EstimatorTraining, Marking, Runway, Scene, SceneError, Tolerance
+from runtime.domain import Edges, Glide, Growth
+from runtime.scene import (
+    Axis,
+    Bank,
+    Calibration,
+    Camera,
+    Domain,
+    EstimatorTraining,
+    Marking,
+    Runway,
+    Scene,
+    SceneError,
+    Tolerance,
+    WindowedBank,
+)
 from runtime.state_set import StateSet, scale_range, tangent_of_row
 
 Floats = NDArray[np.float64]
@@ -114,11 +128,33 @@ SCENES = {
 """Scenes that have a model; `conftest.model_of` exports each when it is first asked for."""
 
 
+FINAL = replace(
+    AIRPORT,
+    camera=Camera(width=480, height=300, focal_length_m=0.008, pixel_pitch_m=12e-6),
+    domain=Domain(
+        Edges((-0.01, 0.02, 0.05)), Edges((-20.0, 20.0)), None, Growth(500.0, 1400.0, 1.5), glide=Glide((0.045, 0.06), aim_m=300.0)
+    ),
+    bank=WindowedBank(set_px=16.0, rows=12, places=64),
+)
+"""A long final over a coarser sensor, x free, altitudes by glide angles, 6 cells of a bank of windows."""
+WINDOWED = {
+    "final": FINAL,
+    "final, few places": replace(FINAL, bank=replace(FINAL.bank, places=3), tolerance=Tolerance(missed_budget=2)),
+    "final, tolerant": replace(
+        tolerant(FINAL, Calibration(principal_px=0.6)),
+        domain=replace(FINAL.domain, x_m=Axis((3.0,), 0.0)),
+        bank=replace(FINAL.bank, places=8),
+    ),
+    "strip in windows": replace(STRIP, bank=WindowedBank(set_px=14.0, rows=10, places=32)),
+}
+"""Scenes with a bank of windows, which have a model too; with few places, many frames overflow them."""
+
+
 def states_of(scene: Scene) -> st.SearchStrategy[Floats]:
     """States of the domain, its faces and corners among them."""
     lower, upper = scene.domain.lower, scene.domain.upper
     shares = st.lists(st.floats(0, 1), min_size=4, max_size=4)
-    return shares.map(lambda share: np.clip(lower + np.array(share) * (upper - lower), lower, upper))
+    return shares.map(lambda share: scene.domain.nearest(lower + np.array(share) * (upper - lower)))
 
 
 def random_clutter(rng: np.random.Generator, shape: tuple[int, int], density: float) -> Frame:

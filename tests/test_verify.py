@@ -11,9 +11,8 @@ import itertools
 import json
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import onnx
@@ -21,13 +20,13 @@ import pytest
 import typer
 from flint import arb, ctx  # pyright: ignore[reportMissingModuleSource]
 from numpy.typing import NDArray
-from onnx import TensorProto, helper, numpy_helper
+from onnx import helper, numpy_helper
+from taken_apart import Model, small_network
 from typer.testing import CliRunner, Result
 
 from build_model.assembly import assemble
 from build_model.export import build_banks, export_model
 from build_model.filter_graph import filter_graph
-from build_model.filter_tables import FilterTables
 from build_model.hough_bank import CellBank
 from build_model.line_boxes import LineBoxes
 from build_model.pixel_mask import runs_of
@@ -39,13 +38,12 @@ from build_model.verify.cell_claim import cell_claims
 from build_model.verify.cell_proof import prove_cell
 from build_model.verify.counterexample import Counterexample, Refuted
 from build_model.verify.displacement import displacement_px
-from build_model.verify.model_graph import read_tables
 from build_model.verify.outputs import check_outputs
 from build_model.verify.proof import verify_model
 from build_model.window import Bits
 from runtime.camera import ground_scale, project, project_points
 from runtime.image import runway_image
-from runtime.model.format import METADATA_KEY, NETWORK_PREFIX, PADDING_SIZE, ModelError, metadata_digest
+from runtime.model.format import NETWORK_PREFIX, PADDING_SIZE, ModelError
 from runtime.scene import Axis, Bank, Calibration, Camera, Domain, Marking, Runway, Scene, Tolerance
 
 SCENE = Scene(
@@ -70,70 +68,6 @@ Rng = np.random.Generator
 PAPER_TOML = Path(__file__).parents[1] / "models" / "paper.toml"
 
 
-@dataclass
-class Model:
-    """A model file taken apart: what a mutation may change."""
-
-    scene: Scene
-    banks: list[CellBank]
-    proto: onnx.ModelProto
-    metadata: dict[str, Any]
-
-    @property
-    def constants(self) -> dict[str, onnx.TensorProto]:
-        return {tensor.name: tensor for tensor in self.proto.graph.initializer}
-
-    def tables(self) -> FilterTables:
-        return read_tables(self.proto.graph, cell_boxes(self.scene))
-
-    def set_constant(self, name: str, values: NDArray) -> None:
-        self.constants[name].CopyFrom(numpy_helper.from_array(np.asarray(values, order="C"), name))
-
-    def set_tables(self, tables: FilterTables) -> None:
-        """NN_F written anew from other tables, as a wrong build would write it."""
-        graph = self.proto.graph
-        expected = filter_graph(self.scene, tables)
-        first = next(place for place, node in enumerate(graph.node) if node.name == "filtered_image")
-        nodes = [*expected.node, *graph.node[first:]]
-        network = [tensor for tensor in graph.initializer if tensor.name.startswith((NETWORK_PREFIX, "batch_and_", "state_shape"))]
-        outputs = [*expected.output, graph.output[-1]]
-        del graph.node[:], graph.initializer[:], graph.output[:]
-        graph.output.extend(outputs)
-        graph.node.extend(nodes)
-        graph.initializer.extend([*expected.initializer, *network])
-        self.metadata["smallest_must_light"] = tables.smallest_must_light
-
-    def set_bank(self, cell: int, **changes: Any) -> None:
-        """The model with another bank for a cell."""
-        self.banks[cell] = replace(self.banks[cell], **changes)
-        self.set_tables(assemble(self.scene, self.banks))
-
-    def save(self, path: Path) -> Path:
-        """Writes the file with its checksums recomputed."""
-        graph = self.proto.graph
-        self.metadata["graph_sha256"] = hashlib.sha256(graph.SerializeToString(deterministic=True)).hexdigest()
-        self.metadata["metadata_sha256"] = metadata_digest(self.metadata)
-        helper.set_model_props(self.proto, {METADATA_KEY: json.dumps(self.metadata, sort_keys=True)})
-        path.write_bytes(self.proto.SerializeToString(deterministic=True))
-        return path
-
-
-def small_network(scene: Scene, path: Path) -> Path:
-    """A user's NN_e: the share of lit pixels, four times."""
-    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 1, *scene.camera.shape])
-    state = helper.make_tensor_value_info("state", TensorProto.FLOAT, [1, 4])
-    constants = {"axes": np.array([2, 3]), "shape": np.array([1, 1]), "weights": np.ones((1, 4), dtype=np.float32)}
-    nodes = [
-        helper.make_node("ReduceMean", ["image", "axes"], ["mean"], keepdims=1),
-        helper.make_node("Reshape", ["mean", "shape"], ["row"]),
-        helper.make_node("MatMul", ["row", "weights"], ["state"]),
-    ]
-    tensors = [numpy_helper.from_array(values, name) for name, values in constants.items()]
-    graph = helper.make_graph(nodes, "share", [image], [state], tensors)
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 20)], ir_version=10), path)
-    return path
-
-
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """One exported model a scene."""
@@ -148,7 +82,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     return paths
 
 
-def taken_apart(path: Path) -> Model:
+def model_of_file(path: Path) -> Model:
     proto = onnx.load(path)
     return Model(SCENE, build_banks(SCENE), proto, json.loads(proto.metadata_props[0].value))
 
@@ -156,14 +90,14 @@ def taken_apart(path: Path) -> Model:
 @pytest.fixture
 def model(files: dict[str, Path]) -> Model:
     """The first scene's model, to be mutated."""
-    return taken_apart(files["paper's shape"])
+    return model_of_file(files["paper's shape"])
 
 
 @pytest.fixture
 def model_in_rows(files: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> Model:
     """The same with several rows a cell, which it keeps when it is written anew."""
     monkeypatch.setattr("build_model.assembly.row_width", lambda _entries: WIDTH)
-    return taken_apart(files["several rows a cell"])
+    return model_of_file(files["several rows a cell"])
 
 
 def bits_of(bank: CellBank) -> tuple[Bits, Bits, Bits]:

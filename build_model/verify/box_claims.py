@@ -10,7 +10,7 @@ import numpy as np
 from flint import arb, ctx  # pyright: ignore[reportMissingModuleSource]
 from numpy.typing import NDArray
 
-from build_model.filter_tables import FilterTables
+from build_model.filter_tables import BankTables
 from build_model.verify.ball_camera import PRECISION_BITS, BallCamera
 from build_model.verify.counterexample import demand
 from runtime.model.format import PADDING_SIZE
@@ -18,7 +18,7 @@ from runtime.model.limits import BELOW_HORIZON_PX, ROWS_BELOW_FRAME, largest_ste
 from runtime.scene import Scene
 
 
-def check_boxes(scene: Scene, tables: FilterTables) -> None:
+def check_boxes(scene: Scene, tables: BankTables) -> None:
     """Boxes of states, scales and reference rows are such as the loader demands. Raises `Refuted` with the first that is not."""
     _check_numbers(scene, tables)
     with ctx.workprec(PRECISION_BITS):
@@ -27,21 +27,21 @@ def check_boxes(scene: Scene, tables: FilterTables) -> None:
             _check_entry(scene, camera, tables, row, place)
 
 
-def entry_at(tables: FilterTables, row: int, place: int) -> tuple[int, int]:
+def entry_at(tables: BankTables, row: int, place: int) -> tuple[int, int]:
     """Cell and number of the entry at a place of a row."""
     cell = tables.row_cell[row]
     before = row - int(np.searchsorted(tables.row_cell, cell))
     return int(cell), before * tables.must_light_size.shape[1] + place
 
 
-def demand_of_all(holds: NDArray[np.bool_], claim: str, tables: FilterTables) -> None:
+def demand_of_all(holds: NDArray[np.bool_], claim: str, tables: BankTables) -> None:
     """Raises `Refuted` with the claim and the first place of the bank, (rows, width), where it does not hold."""
     if not holds.all():
         row, place = np.argwhere(~holds)[0].tolist()
         demand(False, claim, *entry_at(tables, row, place))
 
 
-def _check_numbers(scene: Scene, tables: FilterTables) -> None:
+def _check_numbers(scene: Scene, tables: BankTables) -> None:
     """Boxes are ordered and within the domain, but for float32's rounding; scales are above 0; reference rows are near the frame."""
     padding = tables.must_light_size == PADDING_SIZE
     lower, upper = tables.state_lower, tables.state_upper
@@ -57,7 +57,7 @@ def _check_numbers(scene: Scene, tables: FilterTables) -> None:
         demand_of_all(padding | holds, claim, tables)
 
 
-def _check_entry(scene: Scene, camera: BallCamera, tables: FilterTables, row: int, place: int) -> None:
+def _check_entry(scene: Scene, camera: BallCamera, tables: BankTables, row: int, place: int) -> None:
     """An entry's reference row is below the horizon of its states, its scales within a step of those that they have."""
     lower, upper = tables.state_lower[row, place].astype(np.float64), tables.state_upper[row, place].astype(np.float64)
     lower, upper = np.maximum(lower, scene.domain.lower).tolist(), np.minimum(upper, scene.domain.upper).tolist()
@@ -67,7 +67,8 @@ def _check_entry(scene: Scene, camera: BallCamera, tables: FilterTables, row: in
     where = entry_at(tables, row, place)
     demand(bool(below_horizon >= BELOW_HORIZON_PX), "an entry's reference_row is not certainly below the horizon of its states", *where)
     fall = camera.fall_range(lower[0], upper[0], reference_row)
-    step = arb(float(largest_steps(scene, np.array([[lower[1], upper[1]]]))[0]))
+    scale = np.array([[tables.line_lower[row, place, 2], tables.line_upper[row, place, 2]]])
+    step = arb(float(largest_steps(scene, np.array([[lower[1], upper[1]]]), scale)[0]))
     slowest, fastest = camera.focal_u_px * fall[0] / arb(upper[2]) - step, camera.focal_u_px * fall[1] / arb(lower[2]) + step
     binds = slowest <= float(tables.line_lower[row, place, 2]) and fastest >= float(tables.line_upper[row, place, 2])
     demand(binds, "an entry's scales reach beyond those of its states by more than a step", *where)

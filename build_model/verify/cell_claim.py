@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from build_model.filter_tables import FilterTables
+from build_model.filter_tables import BankTables, FilterTables
 from build_model.verify.counterexample import demand
 from build_model.window import Bits, Window
 from runtime.scene import Scene
@@ -59,25 +60,49 @@ class PaintedRuns:
         return np.cumsum(steps.reshape(window.shape), axis=0)
 
 
-@dataclass(frozen=True)
-class CellClaim:
-    """What the model states of one cell: box [lower, upper] (4,), and its entries' boxes, masks and sizes as the file has them."""
+@dataclass(frozen=True, kw_only=True)
+class BankClaim:
+    """What a model of either kind states of one cell: box [lower, upper] (4,), its entries' boxes and sizes as the file has them."""
 
     scene: Scene
     cell: int
     lower: NDArray[np.float64]
     upper: NDArray[np.float64]
     window: Window
-    spatial: MaskRuns
-    painted: PaintedRuns
-    must_light: MaskRuns
-    may_light: MaskRuns
     must_light_size: NDArray[np.int32]
     line_lower: NDArray[np.float64]
     line_upper: NDArray[np.float64]
     reference_row: NDArray[np.float64]
     state_lower: NDArray[np.float32]
     state_upper: NDArray[np.float32]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CellClaim(BankClaim):
+    """What a model of masks states of one cell: S, and of every entry K and O."""
+
+    spatial: MaskRuns
+    painted: PaintedRuns
+    must_light: MaskRuns
+    may_light: MaskRuns
+
+
+def bank_claim(scene: Scene, tables: BankTables, cell: int) -> dict[str, Any]:
+    """The fields of `BankClaim`, from the tables."""
+    rows = tables.row_cell == cell
+    return {
+        "scene": scene,
+        "cell": cell,
+        "lower": tables.cells.lower[cell],
+        "upper": tables.cells.upper[cell],
+        "window": tables.window,
+        "must_light_size": tables.must_light_size[rows].ravel(),
+        "line_lower": tables.line_lower[rows].reshape(-1, 4),
+        "line_upper": tables.line_upper[rows].reshape(-1, 4),
+        "reference_row": tables.reference_row[rows].ravel(),
+        "state_lower": tables.state_lower[rows].reshape(-1, 4),
+        "state_upper": tables.state_upper[rows].reshape(-1, 4),
+    }
 
 
 def cell_claims(scene: Scene, tables: FilterTables) -> Iterator[CellClaim]:
@@ -95,19 +120,9 @@ def cell_claims(scene: Scene, tables: FilterTables) -> Iterator[CellClaim]:
     for cell in range(len(tables.cells)):
         painted, rows = tables.spatial_runs.cell == cell, tables.row_cell == cell
         yield CellClaim(
-            scene=scene,
-            cell=cell,
-            lower=tables.cells.lower[cell],
-            upper=tables.cells.upper[cell],
-            window=tables.window,
+            **bank_claim(scene, tables, cell),
             spatial=counted(runs.spatial[cell : cell + 1]),
             painted=PaintedRuns(tables.spatial_runs.index[painted], tables.spatial_runs.step[painted]),
             must_light=counted(runs.must_light[rows], witnesses),
             may_light=counted(runs.may_light[rows]),
-            must_light_size=tables.must_light_size[rows].ravel(),
-            line_lower=tables.line_lower[rows].reshape(-1, 4),
-            line_upper=tables.line_upper[rows].reshape(-1, 4),
-            reference_row=tables.reference_row[rows].ravel(),
-            state_lower=tables.state_lower[rows].reshape(-1, 4),
-            state_upper=tables.state_upper[rows].reshape(-1, 4),
         )

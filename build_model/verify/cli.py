@@ -49,6 +49,7 @@ def _table(model: Path, report: proof.VerificationReport) -> Table:
         "pixels of S, bounds proved": report.spatial_pixels,
         "pixels of all O, bounds proved": report.may_light_pixels,
         "pixels of all K, each proved": report.must_light_pixels,
+        "windows, each proved": report.windows,
         "smallest margin": f"{report.margin_px:.3g} px",
         "calibration moves the image by": f"{report.displacement_px:.3f} px at most",
         "seconds": f"{report.seconds:.1f}",

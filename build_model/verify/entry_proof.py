@@ -16,7 +16,7 @@ from flint import arb  # pyright: ignore[reportMissingModuleSource]
 from numpy.typing import NDArray
 
 from build_model.verify.ball_camera import BallEntry, BallInterval, Ends, Slice, columns, columns_crossed
-from build_model.verify.cell_claim import CellClaim
+from build_model.verify.cell_claim import BankClaim
 from build_model.verify.counterexample import Counterexample, Refuted
 from build_model.window import Bits
 
@@ -41,7 +41,7 @@ class _Seen:
 class EntryProver:
     """The proofs of one entry, over slices of its theta."""
 
-    def __init__(self, claim: CellClaim, number: int, entry: BallEntry) -> None:
+    def __init__(self, claim: BankClaim, number: int, entry: BallEntry) -> None:
         self.claim, self.number, self.camera = claim, number, entry.camera
         self.line_px = claim.scene.tolerance.line_px
         self.margin = arb("inf")  # the least margin of the bounds that were proved, px
@@ -65,7 +65,7 @@ class EntryProver:
         return Refuted(Counterexample(claim, self.claim.cell, self.number, pixel, state))
 
     def _some_state(self, part: Slice) -> tuple[float, ...] | None:
-        return next(_states(part), None)
+        return next(states_of(part), None)
 
     def check_state_box(self, lower: NDArray[np.float32], upper: NDArray[np.float32]) -> None:
         """The entry's box of states holds every state of the entry. Raises `Refuted`."""
@@ -75,7 +75,7 @@ class EntryProver:
         holds = holds and (low[0] <= root.low or Slice(entry, root.low, min(low[0], root.high)).empty)
         holds = holds and (high[0] >= root.high or Slice(entry, max(high[0], root.low), root.high).empty)
         if not (holds or root.empty):
-            states = itertools.chain.from_iterable(_states(part) for part in _parts(root, 8))
+            states = itertools.chain.from_iterable(states_of(part) for part in _parts(root, 8))
             outside = (state for state in states if any(not a <= value <= b for a, value, b in zip(low, state, high, strict=True)))
             raise self._refuted("a state of the entry lies outside its box of states", None, next(outside, None))
 
@@ -123,7 +123,7 @@ class EntryProver:
         left, right = min(allowed, key=lambda interval: max(interval[0] - middle, middle - interval[1]))
         if not (low >= left and high < right):
             return False
-        self._keep_margin(low - left, right - high)
+        self.keep_margin(low - left, right - high)
         return True
 
     def _seek_lit_outside(self, allowed: ColumnIntervals, part: Slice, row: int, marking: int) -> None:
@@ -131,8 +131,8 @@ class EntryProver:
         width = part.high - part.low
         if width > max(self.search_width, self.finest_width):
             return
-        for state in _states(part):
-            point = _point(part.entry, state)
+        for state in states_of(part):
+            point = point_of(part.entry, state)
             seen = self._seen(point.entry)[marking]
             scales = None if point.rows(seen.ends) is None else point.scales_crossed_in(row, seen.ends)
             if scales is None:
@@ -168,7 +168,7 @@ class EntryProver:
             smaller, greater = columns_crossed(self.camera, seen.across, scales)
             lit = [column for column in pixels if smaller < column + 1 and greater > column]
             for column in lit:
-                self._keep_margin(column + 1 - smaller, greater - column)
+                self.keep_margin(column + 1 - smaller, greater - column)
             pixels = [column for column in pixels if column not in lit]
         return pixels
 
@@ -177,8 +177,8 @@ class EntryProver:
         width = part.high - part.low
         if width > max(self.search_width, self.finest_width):
             return
-        for state in _states(part):
-            spans = list(self._columns_seen(_point(part.entry, state), row))
+        for state in states_of(part):
+            spans = list(self._columns_seen(point_of(part.entry, state), row))
             for column in pixels:
                 if all(high < column or low >= column + 1 for low, high in spans):
                     raise self._refuted("a state of the entry does not light a pixel of K", (row, column), state)
@@ -194,13 +194,14 @@ class EntryProver:
             elif (scales := point.scales_seen_in(row, seen.ends)) is not None:
                 yield columns(self.camera, seen.across, scales)
 
-    def _keep_margin(self, *margins: arb) -> None:
+    def keep_margin(self, *margins: arb) -> None:
+        """Notes by how much a bound was proved, px, if it is the closest so far."""
         for margin in margins:
             if margin < self.margin:
                 self.margin = margin
 
 
-def _allowed_columns(claim: CellClaim, bits: Bits, first: int, stop: int) -> list[ColumnIntervals]:
+def _allowed_columns(claim: BankClaim, bits: Bits, first: int, stop: int) -> list[ColumnIntervals]:
     """For rows first, ..., stop - 1: the intervals [left, right) of columns where a pixel's neighbourhood, as far as it is in the frame,
     is inside `bits`. One that leaves the frame has an infinite side.
     """
@@ -226,7 +227,7 @@ def _parts(root: Slice, count: int) -> Iterator[Slice]:
     return (Slice(root.entry, low, high) for low, high in itertools.pairwise(edges))
 
 
-def _states(part: Slice) -> Iterator[tuple[float, ...]]:
+def states_of(part: Slice) -> Iterator[tuple[float, ...]]:
     """States of the entry at the slice's middle theta: near the faces of its altitudes, at those of its x and z."""
     entry = part.entry
     low, high = (float(side) for side in Slice(entry, part.middle, part.middle).y)
@@ -238,7 +239,7 @@ def _states(part: Slice) -> Iterator[tuple[float, ...]]:
         yield part.middle, x, y, z
 
 
-def _point(entry: BallEntry, state: tuple[float, ...]) -> Slice:
+def point_of(entry: BallEntry, state: tuple[float, ...]) -> Slice:
     """One state as a slice: every range is that of a single number."""
     theta, x, y, z = state[0], *(arb(value) for value in state[1:])
     scale = entry.camera.focal_u_px * entry.camera.ray(theta, entry.reference_row)[0] / y

@@ -16,13 +16,14 @@ import onnx
 from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
-from build_model.filter_graph import BIT, filter_graph
-from build_model.filter_tables import FilterTables, RunTable, SpatialRuns
+from build_model.bank_graph import BIT
+from build_model.filter_graph import filter_graph
+from build_model.filter_tables import BankTables, FilterTables, RunTable, SpatialRuns, WindowTable, WindowTables
 from build_model.partition import Partition
 from build_model.verify.counterexample import demand
 from build_model.window import Window
 from runtime.model.format import IR_VERSION, NETWORK_OUTPUT, NETWORK_PREFIX, OPSET, SIDES
-from runtime.scene import STATE_NAMES, Scene
+from runtime.scene import STATE_NAMES, Scene, WindowedBank
 
 Part = onnx.NodeProto | onnx.ValueInfoProto
 CONTROL_FLOW = ("If", "Loop", "Scan")
@@ -47,7 +48,7 @@ class _Constants:
         return values
 
 
-def read_tables(graph: onnx.GraphProto, cells: Partition) -> FilterTables:
+def read_tables(graph: onnx.GraphProto, cells: Partition) -> FilterTables | WindowTables:
     """NN_F's tables from the initialisers. Raises `Refuted` if one is missing, or not of a shape that fits the others."""
     constants = _Constants(graph)
     row_cell = constants.read("row_cell", np.int32, -1)
@@ -58,29 +59,51 @@ def read_tables(graph: onnx.GraphProto, cells: Partition) -> FilterTables:
     demand(width > 0, "graph: the bank has no entry")
     (top, left), (bottom, right) = (constants.read(name, np.int64, 2).tolist() for name in ("window_first", "window_stop"))
     window = Window(top, bottom, left, right)
-    painted = SpatialRuns(*(constants.read(f"spatial_run_{name}", np.int32, -1) for name in ("cell", "index", "step")))
-    same = painted.cell.shape == painted.index.shape == painted.step.shape
-    known = bool(((painted.cell >= 0) & (painted.cell < len(cells))).all())
-    demand(same and known, "graph: the constants spatial_run_* do not fit each other or the cells")
     lower, upper = (
         np.stack([constants.read(f"{name}_{side}", np.float32, rows, width) for name in STATE_NAMES], axis=-1) for side in SIDES
     )
     line_lower, line_upper = (constants.read(f"line_{side}", np.float64, rows, width, 4) for side in SIDES)
-    return FilterTables(
-        window=window,
-        cells=cells,
-        cell_lower=np.nextafter(cells.lower.astype(np.float32), np.float32(-np.inf)),
-        cell_upper=np.nextafter(cells.upper.astype(np.float32), np.float32(np.inf)),
-        row_cell=row_cell,
-        runs=_read_runs(constants, window, len(cells), (rows, width)),
-        spatial_runs=painted,
-        must_light_size=size,
-        state_lower=lower,
-        state_upper=upper,
-        line_lower=line_lower,
-        line_upper=line_upper,
-        reference_row=constants.read("reference_row", np.float64, rows, width),
-    )
+    bank = {
+        "window": window,
+        "cells": cells,
+        "cell_lower": np.nextafter(cells.lower.astype(np.float32), np.float32(-np.inf)),
+        "cell_upper": np.nextafter(cells.upper.astype(np.float32), np.float32(np.inf)),
+        "row_cell": row_cell,
+        "must_light_size": size,
+        "state_lower": lower,
+        "state_upper": upper,
+        "line_lower": line_lower,
+        "line_upper": line_upper,
+        "reference_row": constants.read("reference_row", np.float64, rows, width),
+    }
+    if "gate_size" in constants:
+        return WindowTables(**bank, windows=_read_windows(constants, window, len(cells), (rows, width)))
+    runs = _read_runs(constants, window, len(cells), (rows, width))
+    return FilterTables(**bank, runs=runs, spatial_runs=_read_painted(constants, len(cells)))
+
+
+def _read_painted(constants: _Constants, cells: int) -> SpatialRuns:
+    """S of all cells, as it is painted."""
+    painted = SpatialRuns(*(constants.read(f"spatial_run_{name}", np.int32, -1) for name in ("cell", "index", "step")))
+    same = painted.cell.shape == painted.index.shape == painted.step.shape
+    known = bool(((painted.cell >= 0) & (painted.cell < cells)).all())
+    demand(same and known, "graph: the constants spatial_run_* do not fit each other or the cells")
+    return painted
+
+
+def _read_windows(constants: _Constants, window: Window, cells: int, shape: tuple[int, int]) -> WindowTable:
+    """Windows of groups and of entries, and S of all cells. `shape`: (rows, width)."""
+    rows, width = shape
+    size = constants.read("gate_size", np.int32, rows, 1)[:, 0]
+    start = constants.read("window_start", np.int32, rows, -1)
+    demand(start.shape[1] > 0 and start.shape[1] % width == 0, "graph: the constant 'window_start' does not fit the entries")
+    columns = constants.read("window_columns", np.uint8, *start.shape)
+    windows = start.shape[1] // width
+    gate_start, gate_stop = (constants.read(f"gate_{side}", np.int32, rows * windows).reshape(rows, windows) for side in ("start", "stop"))
+    first = constants.read("span_first", np.int16, cells, -1, window.bottom - window.top)
+    stop = constants.read("span_stop", np.int16, *first.shape)
+    by_entry = (rows, width, windows)
+    return WindowTable(size, gate_start, gate_stop, start.reshape(by_entry), columns.reshape(by_entry), first, stop)
 
 
 def _read_runs(constants: _Constants, window: Window, cells: int, shape: tuple[int, int]) -> RunTable:
@@ -106,7 +129,7 @@ def _read_runs(constants: _Constants, window: Window, cells: int, shape: tuple[i
     return RunTable(tuple(blocks), columns, folded, places[0], places[1].reshape(shape), places[2].reshape(shape))
 
 
-def check_graph(model: onnx.ModelProto, scene: Scene, tables: FilterTables) -> None:
+def check_graph(model: onnx.ModelProto, scene: Scene, tables: BankTables) -> None:
     """The file's graph is the NN_F of these tables, followed by an NN_e that reads `filtered` and writes `network_state` alone.
 
     Raises `Refuted` with the first node, constant, input or output that differs.
@@ -114,6 +137,8 @@ def check_graph(model: onnx.ModelProto, scene: Scene, tables: FilterTables) -> N
     window, (height, width) = tables.window, scene.camera.shape
     inside = 0 <= window.top < window.bottom <= height and 0 <= window.left < window.right <= width
     demand(inside, f"graph: the window {window} does not lie in the frame")
+    windowed = isinstance(scene.bank, WindowedBank)
+    demand(windowed == isinstance(tables, WindowTables), "graph: its bank is not of the kind that the scene asks for")
     graph, expected = model.graph, filter_graph(scene, tables)
     _check_file(model)
     _check_each("input", list(graph.input), list(expected.input))

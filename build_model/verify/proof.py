@@ -27,7 +27,7 @@ import numpy as np
 import onnx
 from google.protobuf.message import DecodeError
 
-from build_model.filter_tables import FilterTables
+from build_model.filter_tables import BankTables, FilterTables, WindowTables
 from build_model.partition import Partition
 from build_model.verify.box_claims import check_boxes, demand_of_all
 from build_model.verify.cell_boxes import cell_boxes
@@ -37,6 +37,8 @@ from build_model.verify.counterexample import Counterexample, Refuted, demand
 from build_model.verify.displacement import displacement_px
 from build_model.verify.model_graph import check_graph, read_tables
 from build_model.verify.outputs import check_outputs
+from build_model.verify.window_claim import window_claims
+from build_model.verify.window_proof import prove_windows
 from runtime.assumptions import assumptions
 from runtime.errors import one_line
 from runtime.model.format import METADATA_KEY, PADDING_SIZE, ModelError
@@ -56,6 +58,7 @@ class VerificationReport:
     spatial_pixels: int
     may_light_pixels: int
     must_light_pixels: int
+    windows: int
     margin_px: float
     """Least distance, px, by which a bound on a column keeps from the border that it must not reach."""
     displacement_px: float
@@ -101,6 +104,7 @@ def verify_model(path: str | Path, jobs: int = 1, progress: Progress = _silent) 
         spatial_pixels=sum(proof.spatial_pixels for proof in proofs),
         may_light_pixels=sum(proof.may_light_pixels for proof in proofs),
         must_light_pixels=sum(proof.must_light_pixels for proof in proofs),
+        windows=sum(proof.windows for proof in proofs),
         margin_px=min((proof.margin_px for proof in proofs), default=float("nan")),
         displacement_px=shift_px,
         seconds=time.perf_counter() - start,
@@ -135,7 +139,7 @@ def _opened(content: bytes, name: str) -> tuple[onnx.ModelProto, dict[str, Any],
         raise ModelError(f"{name}: the scene in its metadata is unusable ({error}); export it again with export-model") from error
 
 
-def _check_all_but_masks(model: onnx.ModelProto, metadata: dict[str, Any], scene: Scene) -> tuple[FilterTables, float]:
+def _check_all_but_masks(model: onnx.ModelProto, metadata: dict[str, Any], scene: Scene) -> tuple[BankTables, float]:
     """Graph, metadata, cells' and padding's boxes, calibration. Returns the tables and the displacement, px. Raises `Refuted`."""
     cells = cell_boxes(scene)
     tables = read_tables(model.graph, cells)
@@ -154,7 +158,7 @@ def _check_all_but_masks(model: onnx.ModelProto, metadata: dict[str, Any], scene
     return tables, shift_px
 
 
-def _check_whole_cells(model: onnx.ModelProto, cells: Partition, tables: FilterTables) -> None:
+def _check_whole_cells(model: onnx.ModelProto, cells: Partition, tables: BankTables) -> None:
     """The cells' float32 boxes hold the cells, by no more than rounding asks, and hold the entries' boxes."""
     tensors = {tensor.name: onnx.numpy_helper.to_array(tensor).T for tensor in model.graph.initializer if tensor.name.startswith("whole_")}
     lower, upper = tensors["whole_lower"], tensors["whole_upper"]
@@ -168,7 +172,11 @@ def _check_whole_cells(model: onnx.ModelProto, cells: Partition, tables: FilterT
     demand_of_all(padding | inside, "an entry's box of states reaches out of its cell", tables)
 
 
-def _cell_proofs(scene: Scene, tables: FilterTables, jobs: int) -> Iterator[CellProof | Counterexample]:
-    work = (joblib.delayed(prove_cell)(claim) for claim in cell_claims(scene, tables))
+def _cell_proofs(scene: Scene, tables: BankTables, jobs: int) -> Iterator[CellProof | Counterexample]:
+    if isinstance(tables, WindowTables):
+        work = (joblib.delayed(prove_windows)(claim) for claim in window_claims(scene, tables))
+    else:
+        assert isinstance(tables, FilterTables)
+        work = (joblib.delayed(prove_cell)(claim) for claim in cell_claims(scene, tables))
     for proof in joblib.Parallel(n_jobs=jobs, return_as="generator")(work):
         yield cast(CellProof | Counterexample, proof)

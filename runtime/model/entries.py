@@ -28,8 +28,9 @@ from numpy.typing import NDArray
 
 from runtime.model.format import PADDING_SIZE, SIDES, STATE_BOX_TENSORS, ModelError
 from runtime.model.limits import BELOW_HORIZON_PX, ROWS_BELOW_FRAME, largest_steps
+from runtime.model.spatial_masks import SpatialRuns, SpatialSpans
 from runtime.rounding import OUTWARD_RELATIVE, float32_above, float32_below
-from runtime.scene import STATE_NAMES, Scene
+from runtime.scene import STATE_NAMES, Scene, WindowedBank
 from runtime.state_set import StateSet, tangent_of_row
 
 
@@ -42,10 +43,7 @@ class Entries:
     """The number in `all` of the entry at each place of the bank, (rows * width,); -1 where it has no state."""
     row_cell: NDArray[np.int32]
     """The cell of each row of entries, (rows,)."""
-    run_cell: NDArray[np.int32]
-    run_index: NDArray[np.int32]
-    run_step: NDArray[np.int32]
-    """Ends of the runs of S: their cell, flat index in the window, and 1 at a start or -1 below a stop, (ends,) each."""
+    spatial: SpatialRuns | SpatialSpans
     window: tuple[slice, slice]
 
     @staticmethod
@@ -59,8 +57,7 @@ class Entries:
         number = np.full(len(size), -1)
         number[places[with_states]] = np.arange(with_states.sum())
         window = tuple(slice(int(first), int(stop)) for first, stop in zip(tensors["window_first"], tensors["window_stop"], strict=True))
-        cell, index, step = (tensors[f"spatial_run_{part}"].copy() for part in ("cell", "index", "step"))  # not to keep the file
-        return Entries(sets[with_states], number, tensors["row_cell"].copy(), cell, index, step, (window[0], window[1]))
+        return Entries(sets[with_states], number, tensors["row_cell"].copy(), _spatial(scene, tensors, name), (window[0], window[1]))
 
     def sets(self, passes: NDArray[np.bool_]) -> StateSet:
         """The entries that pass and have states; `passes` is (rows, width), a cell's entries in one row or several."""
@@ -74,25 +71,22 @@ class Entries:
 
     def within(self, cell: int, frame: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """The frame within the cell's spatial mask S."""
-        seen = np.zeros_like(frame)
-        crop = frame[self.window]
-        steps = np.zeros(crop.shape, dtype=np.int32)
-        own = self.run_cell == cell
-        steps.ravel()[self.run_index[own]] = self.run_step[own]  # a run's stop lies below it, and so never on another one's start
-        mask = steps.cumsum(axis=0) > 0
-        seen[self.window] = crop & mask
+        seen, crop = np.zeros_like(frame), frame[self.window]
+        seen[self.window] = crop & self.spatial.bits(cell, crop.shape)
         return seen
 
 
 def _check(scene: Scene, tensors: dict[str, NDArray[Any]], name: str) -> None:
     """Types, shapes and ranges of the initialisers that the runtime reads. Raises `ModelError`."""
-    cells, rows, ends = scene.domain.cell_count, tensors["row_cell"].shape[:1], tensors["spatial_run_index"].shape[:1]
+    cells, rows = scene.domain.cell_count, tensors["row_cell"].shape[:1]
     entries = (*rows, *tensors["must_light_size"].shape[1:2])
     layout = {"row_cell": (np.int32, rows), "must_light_size": (np.int32, entries), "reference_row": (np.float64, entries)}
     layout |= dict.fromkeys(STATE_BOX_TENSORS, (np.float32, entries))
     layout |= {f"line_{side}": (np.float64, (*entries, 4)) for side in SIDES}
     layout |= {f"window_{side}": (np.int64, (2,)) for side in ("first", "stop")}
-    layout |= {f"spatial_run_{part}": (np.int32, ends) for part in ("cell", "index", "step")}
+    layout |= _layout_of_masks(scene, tensors, rows)
+    if missing := sorted(set(layout) - set(tensors)):
+        raise ModelError(f"{name}: it lacks the initialisers {missing}, which its scene asks for; export it again with export-model")
     for label, (dtype, shape) in layout.items():
         found = tensors[label]
         if found.dtype != dtype or found.shape != shape or found.size == 0:
@@ -103,12 +97,26 @@ def _check(scene: Scene, tensors: dict[str, NDArray[Any]], name: str) -> None:
     if rows[0] < cells or not np.array_equal(np.unique(tensors["row_cell"]), np.arange(cells)):
         raise ModelError(f"{name}: row_cell does not give rows to every one of {cells} cells; export it again with export-model")
     first, stop = tensors["window_first"], tensors["window_stop"]
-    inside = bool(((first >= 0) & (first < stop) & (stop <= scene.camera.shape)).all())
-    limits = {"cell": (0, cells - 1), "index": (0, int(np.prod(stop - first)) - 1 if inside else -1), "step": (-1, 1)}
-    for part, (low, high) in limits.items():
-        inside &= bool(((tensors[f"spatial_run_{part}"] >= low) & (tensors[f"spatial_run_{part}"] <= high)).all())
-    if not inside:
+    if not ((first >= 0) & (first < stop) & (stop <= scene.camera.shape)).all():
         raise ModelError(f"{name}: its window or its spatial masks lie outside the frame; export it again with export-model")
+
+
+def _layout_of_masks(scene: Scene, tensors: dict[str, NDArray[Any]], rows: tuple[int, ...]) -> dict[str, tuple[type, tuple[int, ...]]]:
+    """Type and shape that the initialisers of the cells' masks must have."""
+    if isinstance(scene.bank, WindowedBank):
+        height = int(tensors["window_stop"].ravel()[:1].sum() - tensors["window_first"].ravel()[:1].sum())
+        spans = (scene.domain.cell_count, len(scene.runway.markings), height)
+        return {"span_first": (np.int16, spans), "span_stop": (np.int16, spans), "gate_size": (np.int32, (*rows, 1))}
+    ends = tensors["spatial_run_index"].shape[:1] if "spatial_run_index" in tensors else (1,)
+    return {f"spatial_run_{part}": (np.int32, ends) for part in ("cell", "index", "step")}
+
+
+def _spatial(scene: Scene, tensors: dict[str, NDArray[Any]], name: str) -> SpatialRuns | SpatialSpans:
+    """The cells' masks. Raises `ModelError` if they lie outside the window."""
+    height, width = (tensors["window_stop"] - tensors["window_first"]).tolist()
+    if isinstance(scene.bank, WindowedBank):
+        return SpatialSpans.of(tensors, (height, width), name)
+    return SpatialRuns.of(scene, tensors, (height, width), name)
 
 
 def _state_sets(scene: Scene, tensors: dict[str, NDArray[Any]], places: NDArray[np.int64], name: str) -> StateSet:
@@ -157,7 +165,7 @@ def _contracted_scales(scene: Scene, sets: StateSet, name: str) -> NDArray[np.fl
     """
     low, high = (scene.camera.focal_u_px * side for side in sets.reference_range)
     low, high = low / sets.y[:, 1], high / sets.y[:, 0]
-    step = largest_steps(scene, sets.x)
+    step = largest_steps(scene, sets.x, sets.scale)
     slow, fast = sets.scale.T
     wrong = (slow <= 0) | (slow > fast) | (slow < low - step) | (fast > high + step)
     if wrong.any():

@@ -23,6 +23,8 @@ BUDGETS = ("missed_budget", "extra_budget")
 """Initialisers that are inputs too; their defaults are the scene's values."""
 NETWORK_OUTPUT = "network_state"
 OUTPUTS = ("cell", "support", "mismatch", "passes", "cell_lower", "cell_upper", "filtered", NETWORK_OUTPUT)
+OVERFLOW = "overflow"
+"""Output of a bank of windows: True if more groups passed their gates than there are places to open them."""
 NETWORK_PREFIX = "state_network/"
 """Names of NN_e's nodes and constants start with this."""
 
@@ -33,7 +35,9 @@ LINE_BOX_TENSORS = ("line_lower", "line_upper", "reference_row")
 """Each entry's box in theta, x, scale and z, and the row that its scale refers to: what the masks claim. No node reads them."""
 BOX_TENSORS = ("row_cell", *STATE_BOX_TENSORS, *LINE_BOX_TENSORS, "must_light_size")
 MASK_TENSORS = ("spatial_run_cell", "spatial_run_index", "spatial_run_step", "window_first", "window_stop")
-"""Initialisers that hold every entry as a box of states and of line coordinates, and every cell's spatial mask."""
+SPAN_TENSORS = ("span_first", "span_stop", "gate_size", "window_first", "window_stop")
+"""Initialisers that hold every entry as a box of states and of line coordinates, and every cell's spatial mask: in a bank of masks as
+runs of pixels, in one of windows as spans of columns."""
 PADDING_SIZE = 2**20
 """|K| of a place without an entry: more pixels than a window can hold lit, so that it never passes and is never the least mismatch."""
 

@@ -65,8 +65,10 @@ def packaged_model() -> Path:
     raise ModelError("paper.onnx: comes with the package but is missing; give the path of a model, or reinstall glideproof")
 
 
-def parse_model(content: bytes, name: str, wanted: Sequence[str] = ()) -> ModelFile:
-    """Checks format, version, digests and graph, and reads the initialisers `wanted`. `name` is for messages. Raises `ModelError`."""
+def parse_model(content: bytes, name: str, wanted: Sequence[str] = (), either: Sequence[Sequence[str]] = ()) -> ModelFile:
+    """Checks format, version, digests and graph, and reads the initialisers `wanted`, with those of the first group of `either` that are
+    all there. `name` is for messages. Raises `ModelError`.
+    """
     try:
         reader = Reader()
         graph, properties, rest = file_parts(reader, memoryview(content))
@@ -78,6 +80,7 @@ def parse_model(content: bytes, name: str, wanted: Sequence[str] = ()) -> ModelF
         raise ModelError(f"{name}: {error}") from error
     except (IndexError, ValueError) as error:
         raise ModelError(f"{name}: not an ONNX model, or cut short; export it again with export-model") from error
+    wanted = [*wanted, *next((group for group in either if set(group) <= set(constants)), either[0] if either else ())]
     if missing := sorted(set(wanted) - set(constants)):
         raise ModelError(f"{name}: it lacks the initialisers {missing}; export it again with export-model")
     return ModelFile(content, metadata, {label: constants[label] for label in wanted})

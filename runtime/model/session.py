@@ -5,8 +5,8 @@ from __future__ import annotations
 import onnxruntime
 
 from runtime.errors import one_line
-from runtime.model.format import BUDGETS, FRAME, OUTPUTS, ModelError
-from runtime.scene import Scene
+from runtime.model.format import BUDGETS, FRAME, OUTPUTS, OVERFLOW, ModelError
+from runtime.scene import Scene, WindowedBank
 
 LOG_FATAL_ONLY = 4
 
@@ -25,16 +25,21 @@ def open_session(content: bytes, name: str, threads: int) -> onnxruntime.Inferen
         raise ModelError(f"{name}: onnxruntime {onnxruntime.__version__} cannot load it ({reason_of(error)})") from error
 
 
+def outputs_of(scene: Scene) -> tuple[str, ...]:
+    """Names of a model's outputs, in the order in which `Estimator.run` gives them."""
+    return (*OUTPUTS, OVERFLOW) if isinstance(scene.bank, WindowedBank) else OUTPUTS
+
+
 def check_interface(session: onnxruntime.InferenceSession, scene: Scene, entries: tuple[int, ...], name: str) -> None:
     """Inputs and outputs are those of models/README.md, for the scene's frame and cells. Raises `ModelError`."""
     cells, frame = scene.domain.cell_count, list(scene.camera.shape)
     shapes = {"cell": [], "support": [cells], "mismatch": [cells], "passes": list(entries), "filtered": frame, "network_state": [4]}
-    shapes |= {"cell_lower": [cells, 4], "cell_upper": [cells, 4]}
-    types = {"cell": "int64", "support": "int32", "mismatch": "int32", "passes": "bool", "filtered": "uint8"}
+    shapes |= {"cell_lower": [cells, 4], "cell_upper": [cells, 4], OVERFLOW: []}
+    types = {"cell": "int64", "support": "int32", "mismatch": "int32", "passes": "bool", "filtered": "uint8", OVERFLOW: "bool"}
     expected = {
         "inputs": [(FRAME, "tensor(uint8)", frame)],
         "budgets": [(budget, "tensor(int32)", []) for budget in sorted(BUDGETS)],
-        "outputs": [(output, f"tensor({types.get(output, 'float')})", shapes[output]) for output in sorted(OUTPUTS)],
+        "outputs": [(output, f"tensor({types.get(output, 'float')})", shapes[output]) for output in sorted(outputs_of(scene))],
     }
     for kind, values in zip(expected, (session.get_inputs(), session.get_overridable_initializers(), session.get_outputs()), strict=True):
         found = sorted((value.name, value.type, value.shape) for value in values)

@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 from onnx.reference import ReferenceEvaluator
 from onnx.reference.op_run import OpRun
 from rounding_bound import exact_state_and_bound
-from scenes import SCENES, Frame, random_clutter
+from scenes import SCENES, WINDOWED, Frame, random_clutter
 
 from build_model.assembly import assemble
 from build_model.export import build_banks
 from build_model.filter_graph import filter_graph
-from build_model.filter_network import FilterNetwork
+from build_model.filter_network import FilterNetwork, WindowNetwork
 from build_model.hough_bank import CellBank
 from build_model.state_network import StateNetwork
 from runtime.estimator import Estimator
@@ -37,6 +37,7 @@ from runtime.scene import Scene
 ModelOf = Callable[[str], Path]
 Outputs = dict[str, NDArray]
 INTEGERS = ("cell", "support", "mismatch", "passes", "filtered")
+OF_WINDOWS = ("overflow",)
 BOUNDS = ("cell_lower", "cell_upper")
 REFERENCE = ("cell", "support", "mismatch", "filtered", *BOUNDS)
 NAMES = ("paper", "three markings", "cut left", "tolerant", "tolerant, cut left", "one cell")
@@ -51,6 +52,7 @@ STANDARD = {
     "CumSum",
     "Equal",
     "Flatten",
+    "Gather",
     "GatherElements",
     "Gemm",
     "Greater",
@@ -59,7 +61,9 @@ STANDARD = {
     "LessOrEqual",
     "MatMul",
     "MatMulInteger",
+    "Max",
     "MaxPool",
+    "Min",
     "Mul",
     "Neg",
     "Not",
@@ -144,6 +148,22 @@ def test_onnxruntime_gives_the_torch_networks_outputs(model_of: ModelOf, name: s
             assert (found[output] == reference).all(), (output, budgets)
 
 
+@pytest.mark.parametrize("name", WINDOWED)
+def test_onnxruntime_gives_the_torch_networks_outputs_of_windows(model_of: ModelOf, name: str) -> None:
+    """The same of banks of windows, `overflow` too; with few places some frames overflow them and some do not."""
+    scene = WINDOWED[name]
+    network, model = WindowNetwork(scene, build_banks(scene)), session(model_of(name))
+    overflows = set()
+    for number, frame in enumerate(frames_of(scene)):
+        for budgets in (None, (0, -1), (1, 5))[: 3 if number < 2 else 2]:
+            missed, extra = budgets or (scene.tolerance.missed_budget, scene.tolerance.extra_budget)
+            expected, found = network(torch.from_numpy(frame), missed, extra), evaluate(model, frame, budgets)
+            for output in (*REFERENCE, "overflow"):
+                assert np.array_equal(found[output], expected[output].numpy()), (output, number, budgets)
+            overflows.add(bool(found["overflow"]))
+    assert overflows == {True, False}
+
+
 @pytest.mark.parametrize(("name", "width"), [("paper", 64), ("paper", 7), ("tolerant, free x", 3), ("one cell", 1)])
 def test_rows_of_any_width_give_the_same(monkeypatch: pytest.MonkeyPatch, name: str, width: int) -> None:
     """A cell's entries in several rows: all outputs as the torch network gives them; `passes` cut into rows, padding never among it."""
@@ -193,7 +213,7 @@ LEVELS = tuple(onnxruntime.GraphOptimizationLevel.__members__.values())
 OTHER_OPSETS = (18, 24)
 """The oldest and the newest that onnx's version converter takes this graph to."""
 CLUTTER = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 0.8, 1.0)
-COMPARED = ("committed", "tolerant", "free x")
+COMPARED = ("committed", "tolerant", "free x", "final, few places", "final, tolerant")
 
 
 @pytest.fixture(scope="module")
@@ -252,7 +272,7 @@ class Expected:
         """Integers and bounds to the last bit, `network_state` within its bound."""
         expected = self.outputs[number, budgets]
         assert set(found) == set(expected)
-        for output in (*INTEGERS, *BOUNDS):
+        for output in (*INTEGERS, *BOUNDS, *(name for name in OF_WINDOWS if name in expected)):
             wanted = expected[output]
             if flushes_denormals and output in BOUNDS:
                 wanted = np.where(np.abs(wanted) < np.finfo(np.float32).smallest_normal, np.float32(0), wanted)
