@@ -45,6 +45,10 @@ def export_model(
     dask: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="dask.distributed scheduler whose workers build them instead.")
     ] = None,
+    memory_mb: Annotated[
+        int | None, typer.Option("--memory-mb", min=1, help="Memory that the build may take; by default most of what is free.")
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Tell what the scene takes to build, and build nothing.")] = False,
 ) -> None:
     """Build NN_F from the scene, train NN_e (or take yours), and write one ONNX file with both."""
     target = output or Path("out")
@@ -52,7 +56,10 @@ def export_model(
         target /= f"{scene.stem}.onnx"
     console = terminal.console()
     with _interrupts_end_in_a_line(target):
-        loaded, report = _export(console, scene, target, estimator=estimator, seed=seed, jobs=jobs, dask=dask)
+        loaded, may_take = _planned(console, scene, estimator is None, 1 if dask else jobs, memory_mb)
+        if dry_run:
+            return
+        report = _export(console, loaded, target, estimator=estimator, seed=seed, jobs=jobs, dask=dask, memory_mb=may_take)
     _print_summary(console, loaded, target, report, _clean_half_widths(target))
 
 
@@ -82,18 +89,37 @@ def _interrupts_end_in_a_line(target: Path) -> Iterator[None]:
         signal.signal(signal.SIGINT, earlier)
 
 
-def _export(console: Console, scene: Path, target: Path, **options: Any) -> tuple[Scene, ExportReport]:
-    """Reads the scene and builds the model, with a progress bar. torch is imported here, where an interrupt is provided for."""
+def _planned(console: Console, path: Path, trained: bool, jobs: int, memory_mb: float | None) -> tuple[Scene, float]:
+    """Reads the scene, prints what it takes to build, and refuses what takes more memory than it may, MB; returns both."""
+    from build_model.build_size import build_size, check_size, free_memory_mb
+    from runtime.scene import Scene, SceneError
+
+    may_take = free_memory_mb() if memory_mb is None else memory_mb
+    try:
+        scene = Scene.load(path)
+        size = build_size(scene, jobs, trained)
+        console.print(f"{path}: what it takes, estimated before anything is built")
+        table = Table(show_header=False)
+        for name, value in {**size.rows(), "memory that it may take": f"{may_take:.0f} MB"}.items():
+            table.add_row(name, value)
+        console.print(table)
+        check_size(scene, size, may_take)
+    except SceneError as error:
+        fail(error)
+    return scene, may_take
+
+
+def _export(console: Console, scene: Scene, target: Path, **options: Any) -> ExportReport:
+    """Builds the model, with a progress bar. torch is imported here, where an interrupt is provided for."""
     try:
         from build_model.export import ClusterError, export_model
         from build_model.user_network import EstimatorError
-        from runtime.scene import Scene, SceneError
+        from runtime.scene import SceneError
     except ModuleNotFoundError as error:
         fail(f"export-model: the package {error.name!r} is missing; pip install 'glideproof[build]'")
     try:
-        loaded = Scene.load(scene)
         with _progress(console) as bars:
-            return loaded, export_model(loaded, target, progress=_Bars(bars).update, **options)
+            return export_model(scene, target, progress=_Bars(bars).update, **options)
     except (SceneError, EstimatorError, ClusterError) as error:
         fail(error)
     except OSError as error:

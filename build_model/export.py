@@ -13,6 +13,7 @@ import platform
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib import metadata as distributions
@@ -29,6 +30,7 @@ from onnx import TensorProto, helper
 
 from build_model.assembly import assemble
 from build_model.bank_graph import GraphWriter
+from build_model.build_size import BuildTooLargeError, Ledger
 from build_model.calibration import check_calibration
 from build_model.constant_network import constant_network
 from build_model.filter_graph import filter_graph
@@ -36,7 +38,7 @@ from build_model.filter_tables import BankTables
 from build_model.hough_bank import CellBank, cell_bank
 from build_model.paper.paper_bound import PaperBound, paper_bound
 from build_model.partition import partition
-from build_model.state_network import TrainingReport, state_graph, train_state_network
+from build_model.state_network import TrainingReport, domain_window, state_graph, train_state_network
 from build_model.user_network import bare, user_network
 from build_model.window_bank import CellWindows, cell_windows
 from runtime.assumptions import assumptions
@@ -100,17 +102,21 @@ def export_model(
     seed: int = 0,
     jobs: int = 1,
     dask: str | None = None,
+    memory_mb: float | None = None,
     progress: Progress = _silent,
 ) -> ExportReport:
     """Builds the scene's model and writes it to `path`, whole or not at all.
 
     `estimator`: an ONNX file to serve as NN_e in place of a trained one, or `NO_ESTIMATOR`. `jobs`, `dask`: who builds the cells
-    (`build_banks`). Raises `SceneError` for a scene that has no certificate, `EstimatorError` for a network that does not fit,
-    `ClusterError` for a cluster that cannot be used, OSError if the file cannot be written.
+    (`build_banks`). `memory_mb`: what the build may take; by default all there is. Raises `SceneError` for a scene that has no certificate,
+    or whose tables do not fit into that, `EstimatorError` for a network that does not fit, `ClusterError` for a cluster that cannot be
+    used, OSError if the file cannot be written.
     """
     watch = _Stopwatch()
     with watch.stage("NN_F"):
-        banks = build_banks(scene, jobs, progress, dask)
+        if not scene.calibration.exact:
+            check_calibration(scene, domain_window(scene))  # of the tables' window again below: this spares a build in vain
+        banks = build_banks(scene, jobs, progress, dask, memory_mb)
         tables = assemble(scene, banks)
         shift_px = check_calibration(scene, tables.window)
         filter_part = filter_graph(scene, tables)
@@ -135,19 +141,25 @@ def export_model(
     )
 
 
-def build_banks(scene: Scene, jobs: int = 1, progress: Progress = _silent, dask: str | None = None) -> list[CellBank] | list[CellWindows]:
+def build_banks(
+    scene: Scene, jobs: int = 1, progress: Progress = _silent, dask: str | None = None, memory_mb: float | None = None
+) -> list[CellBank] | list[CellWindows]:
     """S, entries, and O and K or windows of every cell, in the order of the partition.
 
     Cells are independent: `jobs` local processes build them, or the workers of the dask.distributed scheduler at the address `dask`,
-    who must have the same version of this package; cells of a worker that is lost are built by another one. Raises `ClusterError`.
+    who must have the same version of this package; cells of a worker that is lost are built by another one. Raises `ClusterError`, and
+    `BuildTooLargeError` where the tables of the cells will take more than `memory_mb`, or memory runs out.
     """
     cells = partition(scene)
+    ledger = None if memory_mb is None else Ledger(len(cells), memory_mb)
     build = cell_windows if isinstance(scene.bank, WindowedBank) else cell_bank
     work = (joblib.delayed(build)(scene, lower, upper) for lower, upper in zip(cells.lower, cells.upper, strict=True))
     banks = []
     with _workers(jobs, dask):
         for bank in joblib.Parallel(return_as="generator")(work):
             banks.append(bank)
+            if ledger is not None:
+                ledger.add(cast(CellBank | CellWindows, bank))
             progress("cells", len(banks), len(cells), None)
     return banks
 
@@ -169,8 +181,11 @@ def paper_bounds(scene: Scene, jobs: int = 1, dask: str | None = None) -> list[P
 def _workers(jobs: int, dask: str | None) -> Iterator[None]:
     """Where joblib runs its calls: local processes, or a dask cluster."""
     if dask is None:
-        with joblib.parallel_config(n_jobs=jobs):
-            yield
+        try:
+            with joblib.parallel_config(n_jobs=jobs):
+                yield
+        except (MemoryError, BrokenProcessPool) as error:
+            raise BuildTooLargeError(f"--jobs: found {jobs}; a process that builds cells had no memory left: give fewer") from error
         return
     try:
         from distributed import Client

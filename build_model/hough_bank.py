@@ -15,7 +15,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +30,11 @@ from runtime.model.limits import SCALE_STEP, SMALLEST_LEVER_M
 from runtime.rounding import float32_above, float32_below, inverted
 from runtime.scene import STATE_NAMES, Bank, Scene, SceneError
 from runtime.state_set import StateSet, contract, scale_range, tangent_of_row
+
+BATCH_BYTES = 2**26
+"""What the masks of the entries that are made together take at most, or those of one entry."""
+BYTES_A_ROW, BYTES_A_PIXEL = 64, 8
+"""Of an entry while its masks are made: what a row takes for each marking and once more, and what a pixel of the window takes."""
 
 
 @dataclass(frozen=True)
@@ -69,48 +75,147 @@ def mask_bank(scene: Scene) -> Bank:
 
 def line_boxes(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> LineBoxes:
     """Boxes that together cover the cell [lower, upper], both (4,): equal bins of theta, z and x, and of the scale as fine as needed."""
-    bank = mask_bank(scene)
     boxes = []
+    for theta, z, row, scale, lateral in _columns_of_boxes(scene, lower, upper):
+        for x, bins in zip(lateral, _scale_bins(scene, lateral, scale), strict=True):
+            sides = np.empty((len(bins), 4, 2))
+            sides[:, 0], sides[:, 1], sides[:, 2], sides[:, 3] = theta, x, bins, z
+            boxes.append((sides, np.full(len(bins), row)))
+    sides, rows = (np.concatenate(part) for part in zip(*boxes, strict=True))
+    return LineBoxes(sides[:, :, 0], sides[:, :, 1], rows)
+
+
+def box_count(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> int:
+    """Number of the cell's `line_boxes`, without making them."""
+    counts = 0
+    for _, _, _, scale, lateral in _columns_of_boxes(scene, lower, upper):
+        first, last = _scale_borders(scene, lateral, scale)[1:]
+        counts += int((last - first).sum())
+    return counts
+
+
+def _columns_of_boxes(
+    scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]
+) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], float, NDArray[np.float64], NDArray[np.float64]]]:
+    """For each bin of theta and z of a cell: both, (2,) each, the reference row, the scale's range there, (2,), and bins of x (bins, 2)."""
+    bank = mask_bank(scene)
     for theta, z in itertools.product(sliced(lower[0], upper[0], bank.pitch_bins), sliced(lower[3], upper[3], bank.distance_bins)):
         low, high = lower.copy(), upper.copy()
         (low[0], high[0]), (low[3], high[3]) = theta, z
         row = reference_row(scene.camera, low, high, scene.runway.ends_z_m.mean())
         scale = np.array(scale_range(scene.camera, theta, np.array([lower[2], upper[2]]), tangent_of_row(scene.camera, row)))
         lateral_bins = max(1, math.ceil((upper[1] - lower[1]) * scale[1] / bank.lateral_px))
-        for x in sliced(lower[1], upper[1], lateral_bins):
-            boxes += [(theta, x, bin_, z, row) for bin_ in _scale_bins(scene, x, scale)]
-    sides = np.array([[theta, x, scale, z] for theta, x, scale, z, _ in boxes])
-    return LineBoxes(sides[:, :, 0], sides[:, :, 1], np.array([row for *_, row in boxes]))
+        yield theta, z, row, scale, sliced(lower[1], upper[1], lateral_bins)
 
 
-def _scale_bins(scene: Scene, x: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Intervals of the scale that cover `scale` (2,), above 0, each moving the outermost marking by at most `column_px`: (bins, 2)."""
-    lever_m = max(np.abs(scene.runway.x_m[:, None] - x).max(), SMALLEST_LEVER_M)
-    step = max(math.floor(mask_bank(scene).column_px / lever_m / SCALE_STEP), 1) * SCALE_STEP
-    edges = np.arange(math.floor(scale[0] / step), math.ceil(scale[1] / step) + 1) * step
-    edges[0] = max(edges[0], 2.0 ** (math.frexp(scale[0])[1] - 2))  # a quarter to a half of the smallest scale, where the edge is 0
-    return np.stack([edges[:-1], edges[1:]], axis=-1)
+def _scale_borders(scene: Scene, x: NDArray[np.float64], scale: NDArray[np.float64]) -> tuple[NDArray, NDArray, NDArray]:
+    """For each bin of x, (bins, 2): the step of the scale that moves the outermost marking by at most `column_px`, and the numbers of the
+    first and the last step that cover `scale` (2,), above 0; (bins,) each.
+    """
+    lever_m = np.maximum(np.abs(scene.runway.x_m[:, None] - x[:, None, :]).max(axis=(1, 2)), SMALLEST_LEVER_M)
+    step = np.maximum(np.floor(mask_bank(scene).column_px / lever_m / SCALE_STEP), 1) * SCALE_STEP
+    return step, np.floor(scale[0] / step), np.ceil(scale[1] / step)
+
+
+def _scale_bins(scene: Scene, x: NDArray[np.float64], scale: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
+    """For each bin of x, (bins, 2): intervals of the scale that cover `scale` (2,), above 0, (intervals, 2)."""
+    lowest = 2.0 ** (math.frexp(scale[0])[1] - 2)  # a quarter to a half of the smallest scale, where the edge is 0
+    for step, first, last in zip(*_scale_borders(scene, x, scale), strict=True):
+        edges = np.arange(int(first), int(last) + 1) * step
+        edges[0] = max(edges[0], lowest)
+        yield np.stack([edges[:-1], edges[1:]], axis=-1)
 
 
 @dataclass(frozen=True)
-class _Entries:
-    """Entries with their masks as bits in the cell's window, (entries, rows, columns)."""
+class Entries:
+    """Entries of a cell as sets of states, with their masks."""
 
     lines: LineBoxes
     states: StateSet
-    must_light: Bits
-    may_light: Bits
+    must_light: VerticalRuns
+    may_light: VerticalRuns
 
-    def __getitem__(self, chosen: NDArray[np.bool_]) -> _Entries:
-        return _Entries(self.lines[chosen], self.states[chosen], self.must_light[chosen], self.may_light[chosen])
+    def __len__(self) -> int:
+        return len(self.lines)
+
+    def __getitem__(self, chosen: NDArray[np.bool_]) -> Entries:
+        return Entries(self.lines[chosen], self.states[chosen], self.must_light.chosen(chosen), self.may_light.chosen(chosen))
+
+    @staticmethod
+    def joined(parts: Sequence[Entries]) -> Entries:
+        """All entries of one part or more, in order."""
+        sizes, states = [len(part) for part in parts], [part.states for part in parts]
+        return Entries(
+            LineBoxes.joined([part.lines for part in parts]),
+            StateSet(*(np.concatenate([getattr(sets, field.name) for sets in states]) for field in fields(StateSet))),
+            VerticalRuns.joined([part.must_light for part in parts], sizes),
+            VerticalRuns.joined([part.may_light for part in parts], sizes),
+        )
 
     def weak(self, missed_budget: int) -> NDArray[np.bool_]:
         """True for entries with |K| <= missed_budget, which would pass on any frame."""
-        return self.must_light.sum(axis=(1, 2)) <= missed_budget
+        return self.must_light.sizes(len(self)) <= missed_budget
 
     def hopeless(self, missed_budget: int) -> bool:
         """True if some entry has |O| <= missed_budget: no part of it will ever have a larger |K|."""
-        return bool((self.may_light.sum(axis=(1, 2)) <= missed_budget).any())
+        return bool((self.may_light.sizes(len(self)) <= missed_budget).any())
+
+
+@dataclass(frozen=True)
+class CellMasks:
+    """A cell [lower, upper], (4,) each, its S as bits in a window, and what makes its entries' masks."""
+
+    scene: Scene
+    lower: NDArray[np.float64]
+    upper: NDArray[np.float64]
+    spatial: Bits
+    window: Window
+
+    @staticmethod
+    def of(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> CellMasks:
+        """The cell [lower, upper] and its S."""
+        return CellMasks(scene, lower, upper, *spatial_filter(scene, lower, upper))
+
+    def strong_entries(self, lines: LineBoxes) -> Entries:
+        """The entries of some boxes, those that would pass on any frame halved until their parts are stronger.
+
+        Raises `SceneError` where `HALVINGS` do not get there.
+        """
+        missed_budget = self.scene.tolerance.missed_budget
+        parts = [self.entries(lines)]
+        for halving in range(HALVINGS):
+            weak = parts[-1].weak(missed_budget)
+            if not 0 < weak.sum() <= MOST_WEAK or parts[-1].hopeless(missed_budget):
+                break
+            halves = parts[-1].lines[weak].halved(HALVING_ORDER[halving % len(HALVING_ORDER)])
+            parts[-1:] = [parts[-1][~weak], self.entries(halves)]
+        _demand_strong(self.scene, parts[-1])
+        return Entries.joined(parts)
+
+    def entries(self, lines: LineBoxes) -> Entries:
+        """The entries of the boxes that are not proved empty, made a few at a time: masks as bits take `BATCH_BYTES` at most."""
+        states = contract(self.scene.camera, lines.states(self.scene.camera, self.lower, self.upper))
+        kept = ~(inverted(*states.theta.T) | inverted(*states.y.T))
+        lines, states = lines[kept], states[kept]
+        most = max(1, BATCH_BYTES // self.bytes_an_entry)
+        batches = [self._masks(states[first : first + most]) for first in range(0, max(len(lines), 1), most)]
+        sizes = [len(states[first : first + most]) for first in range(0, max(len(lines), 1), most)]
+        must_light, may_light = (VerticalRuns.joined(masks, sizes) for masks in zip(*batches, strict=True))
+        return Entries(lines, states, must_light, may_light)
+
+    @property
+    def bytes_an_entry(self) -> int:
+        """About what the masks of an entry take while they are made: bounds a row and a marking, and bits in the window."""
+        rows, pixels = self.scene.camera.height + 2 * self.scene.tolerance.line_px, math.prod(self.window.shape)
+        return BYTES_A_ROW * rows * (1 + len(self.scene.runway.markings)) + BYTES_A_PIXEL * pixels
+
+    def _masks(self, states: StateSet) -> tuple[VerticalRuns, VerticalRuns]:
+        """K and O of sets of states."""
+        scene, line_px = self.scene, self.scene.tolerance.line_px
+        may_light = widened(scene, columns_that_may_be_lit(scene, states, line_px), line_px)
+        may_light = runs_of(paint(may_light, self.window) & self.spatial, self.window)
+        must_light = inset(scene, columns_that_must_be_lit(scene, states), line_px)
+        return runs_of(paint(must_light, self.window), self.window), may_light
 
 
 def cell_bank(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> CellBank:
@@ -119,46 +224,26 @@ def cell_bank(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float6
     Boxes without a state of the cell are dropped, if proved so. An entry with |K| <= missed_budget would pass on any frame: it is halved
     until its parts are stronger. Raises `SceneError` where `HALVINGS` do not get there.
     """
-    spatial, window = spatial_filter(scene, lower, upper)
-    parts = [_entries(scene, line_boxes(scene, lower, upper), lower, upper, spatial, window)]
-    for halving in range(HALVINGS):
-        weak = parts[-1].weak(scene.tolerance.missed_budget)
-        if not 0 < weak.sum() <= MOST_WEAK or parts[-1].hopeless(scene.tolerance.missed_budget):
-            break
-        halves = parts[-1].lines[weak].halved(HALVING_ORDER[halving % len(HALVING_ORDER)])
-        parts[-1:] = [parts[-1][~weak], _entries(scene, halves, lower, upper, spatial, window)]
-    _demand_strong(scene, parts[-1])
-    state_lower, state_upper = (np.concatenate([getattr(part.states, side) for part in parts]) for side in ("lower", "upper"))
+    cell = CellMasks.of(scene, lower, upper)
+    entries = cell.strong_entries(line_boxes(scene, lower, upper))
     return CellBank(
-        lines=LineBoxes.joined([part.lines for part in parts]),
-        spatial=runs_of(spatial[None], window),
-        must_light=runs_of(np.concatenate([part.must_light for part in parts]), window),
-        may_light=runs_of(np.concatenate([part.may_light for part in parts]), window),
-        window=window,
-        state_lower=float32_below(state_lower),
-        state_upper=float32_above(state_upper),
+        lines=entries.lines,
+        spatial=runs_of(cell.spatial[None], cell.window),
+        must_light=entries.must_light,
+        may_light=entries.may_light,
+        window=cell.window,
+        state_lower=float32_below(entries.states.lower),
+        state_upper=float32_above(entries.states.upper),
     )
 
 
-def _entries(
-    scene: Scene, lines: LineBoxes, lower: NDArray[np.float64], upper: NDArray[np.float64], spatial: Bits, window: Window
-) -> _Entries:
-    """The masks of the boxes that are not proved empty."""
-    states = contract(scene.camera, lines.states(scene.camera, lower, upper))
-    kept = ~(inverted(*states.theta.T) | inverted(*states.y.T))
-    lines, states = lines[kept], states[kept]
-    line_px = scene.tolerance.line_px
-    may_light = paint(widened(scene, columns_that_may_be_lit(scene, states, line_px), line_px), window) & spatial
-    must_light = paint(inset(scene, columns_that_must_be_lit(scene, states), line_px), window)
-    return _Entries(lines, states, must_light, may_light)
-
-
-def _demand_strong(scene: Scene, entries: _Entries) -> None:
+def _demand_strong(scene: Scene, entries: Entries) -> None:
     weak = np.flatnonzero(entries.weak(scene.tolerance.missed_budget))
     if len(weak):
         low, high = entries.states.lower[weak[0]], entries.states.upper[weak[0]]
+        pixels = int(entries.must_light.sizes(len(entries))[weak[0]])
         where = ", ".join(f"{name} {a:.4g}..{b:.4g}" for name, a, b in zip(STATE_NAMES, low, high, strict=True))
         raise SceneError(
-            f"bank: in {where}, only {entries.must_light[weak[0]].sum()} pixels are lit by all states of a small part, which does "
+            f"bank: in {where}, only {pixels} pixels are lit by all states of a small part, which does "
             f"not exceed missed_budget {scene.tolerance.missed_budget}; keep the runway in view there, or lower the budget"
         )

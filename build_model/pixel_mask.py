@@ -6,6 +6,7 @@ With sums of the frame down its columns, a mask's lit pixels are counted by two 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +34,18 @@ class VerticalRuns:
         steps[self.mask, self.start - window.top, self.column - window.left] = 1
         np.subtract.at(steps, (self.mask, self.stop - window.top, self.column - window.left), 1)
         return np.cumsum(steps, axis=1, dtype=np.int8)[:, :-1].astype(bool)
+
+    def chosen(self, which: NDArray[np.bool_]) -> VerticalRuns:
+        """The masks marked in `which`, (masks,), renumbered in their order."""
+        kept, number = which[self.mask], np.cumsum(which) - 1
+        return VerticalRuns(number[self.mask[kept]], self.column[kept], self.start[kept], self.stop[kept])
+
+    @staticmethod
+    def joined(parts: Sequence[VerticalRuns], masks: Sequence[int]) -> VerticalRuns:
+        """All masks of several parts, of so many each, in one order."""
+        first = np.cumsum([0, *masks[:-1]])
+        mask = np.concatenate([part.mask + number for part, number in zip(parts, first, strict=True)])
+        return VerticalRuns(mask, *(np.concatenate([getattr(part, name) for part in parts]) for name in ("column", "start", "stop")))
 
     def sizes(self, masks: int) -> NDArray[np.int64]:
         """Pixels of each mask, (masks,)."""

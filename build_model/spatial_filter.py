@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from build_model.enclosure import columns_that_may_be_lit
+from build_model.enclosure import Columns, columns_that_may_be_lit
 from build_model.partition import partition
 from build_model.pixel_mask import paint, widened, window_of
 from build_model.window import Bits, Window
@@ -55,10 +55,20 @@ def slice_cell(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float
 
 def spatial_filter(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> tuple[Bits, Window]:
     """S of the cell [lower, upper], both (4,): bits (rows, columns) in the window that is returned with them."""
-    line_px = scene.tolerance.line_px
-    columns = widened(scene, columns_that_may_be_lit(scene, slice_cell(scene, lower, upper), line_px), line_px)
+    columns = _spatial_columns(scene, lower, upper)
     window = window_of(columns)
     return np.logical_or.reduce(paint(columns, window), axis=0), window
+
+
+def spatial_window(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> Window:
+    """The window of the cell's S, at a small part of what it costs to paint it."""
+    return window_of(_spatial_columns(scene, lower, upper))
+
+
+def _spatial_columns(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> Columns:
+    """The columns of S in each slice of the cell, a marking and a row."""
+    line_px = scene.tolerance.line_px
+    return widened(scene, columns_that_may_be_lit(scene, slice_cell(scene, lower, upper), line_px), line_px)
 
 
 def spatial_filters(scene: Scene) -> Bits:

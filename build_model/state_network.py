@@ -25,7 +25,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from build_model.partition import partition
-from build_model.spatial_filter import spatial_filter
+from build_model.spatial_filter import spatial_window
 from build_model.window import Window
 from runtime.camera import project
 from runtime.image import image_of_ends
@@ -188,7 +188,7 @@ def state_graph(network: StateNetwork, opset: int) -> onnx.ModelProto:
 def domain_window(scene: Scene) -> Window:
     """The smallest window that holds S of every cell: what lies outside it is dark in every filtered frame."""
     cells = partition(scene)
-    return reduce(Window.union, (spatial_filter(scene, lower, upper)[1] for lower, upper in zip(cells.lower, cells.upper, strict=True)))
+    return reduce(Window.union, (spatial_window(scene, lower, upper) for lower, upper in zip(cells.lower, cells.upper, strict=True)))
 
 
 def in_whole_blocks(window: Window, height: int) -> Window:

@@ -22,7 +22,9 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -191,13 +193,27 @@ def group_boxes(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.floa
 
     The step is `set_px`, or less where the runway spans few rows; twice as much along an axis that the group is halved along.
     """
+    boxes = []
+    for theta, z, row, lateral, scales in _columns_of_boxes(scene, lower, upper):
+        boxes += [(theta, x, bin_, z, row) for x in lateral for bin_ in scales]
+        _demand_few(scene, len(boxes))
+    sides = np.array([[theta, x, scale, z] for theta, x, scale, z, _ in boxes])
+    return LineBoxes(sides[:, :, 0], sides[:, :, 1], np.array([row for *_, row in boxes]))
+
+
+def group_count(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> int:
+    """Number of the cell's `group_boxes`, without making them."""
+    return sum(len(lateral) * len(scales) for _, _, _, lateral, scales in _columns_of_boxes(scene, lower, upper))
+
+
+def _columns_of_boxes(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> Iterator[tuple[Any, Any, float, Any, Any]]:
+    """For each bin of theta and z of a cell: both, (2,) each, the reference row, and bins of x and of the scale, (bins, 2) each."""
     step = step_px(scene, lower, upper)
     steps = {axis: 2 * step if axis in halved_axes(scene) else step for axis in ("theta", "x", "scale", "z")}
     camera, near_m = scene.camera, scene.runway.ends_z_m.min()
     moved_by_z = camera.focal_v_px * upper[2] * (1 / (lower[3] + near_m) - 1 / (upper[3] + near_m))
     z_bins, theta_bins = _bins(moved_by_z, steps["z"]), _bins(camera.focal_v_px * (upper[0] - lower[0]), steps["theta"])
     _demand_few(scene, theta_bins * z_bins)
-    boxes = []
     for theta, z in itertools.product(sliced(lower[0], upper[0], theta_bins), sliced(lower[3], upper[3], z_bins)):
         low, high = lower.copy(), upper.copy()
         (low[0], high[0]), (low[3], high[3]) = theta, z
@@ -206,10 +222,8 @@ def group_boxes(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.floa
         x_bins = _bins((upper[1] - lower[1]) * scale.mean(), steps["x"])
         below_horizon_px = row - (camera.v0 - camera.focal_v_px * math.tan(theta.mean()))
         scales = _scale_bins(scene, scale, steps["scale"], below_horizon_px)
-        _demand_few(scene, len(boxes) + x_bins * len(scales))
-        boxes += [(theta, x, bin_, z, row) for x in sliced(lower[1], upper[1], x_bins) for bin_ in scales]
-    sides = np.array([[theta, x, scale, z] for theta, x, scale, z, _ in boxes])
-    return LineBoxes(sides[:, :, 0], sides[:, :, 1], np.array([row for *_, row in boxes]))
+        _demand_few(scene, x_bins * len(scales))
+        yield theta, z, row, sliced(lower[1], upper[1], x_bins), scales
 
 
 def step_px(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> float:
@@ -267,13 +281,18 @@ def _without_states(sets: StateSet) -> Bits:
     return inverted(*sets.theta.T) | inverted(*sets.y.T)
 
 
+def sets_at_once(scene: Scene) -> int:
+    """How many sets' columns are bounded at once."""
+    return max(MOST_AT_ONCE // (len(scene.runway.markings) * scene.camera.height), 1)
+
+
 def must_hit_windows(scene: Scene, sets: StateSet, spans: Spans) -> Windows:
     """Windows of every set at `bank.rows` borders, spread over every other one of those that all of its states cross.
 
     The pixels by their two rows, a column more on both sides, lie in the frame, `line_px` from its border, beyond which a witness could
     lie; no two windows of a set share one. Where those of two markings meet, the left one is kept.
     """
-    size = max(MOST_AT_ONCE // (len(scene.runway.markings) * scene.camera.height), 1)
+    size = sets_at_once(scene)
     blocks = [sets[first : first + size] for first in range(0, len(sets), size)]
     if not blocks:
         places = windowed_bank(scene).rows * len(scene.runway.markings)
