@@ -40,7 +40,7 @@ from build_model.user_network import bare, user_network
 from runtime.assumptions import assumptions
 from runtime.model.format import FORMAT_VERSION, IR_VERSION, METADATA_KEY, NETWORK_OUTPUT, NETWORK_PREFIX, OPSET, metadata_digest
 from runtime.rounding import OUTWARD_PX
-from runtime.scene import Scene
+from runtime.scene import Scene, SceneError
 from runtime.whole_file import write_whole
 
 Progress = Callable[[str, int, int, float | None], None]
@@ -106,6 +106,8 @@ def export_model(
     (`build_banks`). Raises `SceneError` for a scene that has no certificate, `EstimatorError` for a network that does not fit,
     `ClusterError` for a cluster that cannot be used, OSError if the file cannot be written.
     """
+    if not scene.camera.pinhole:
+        raise SceneError("camera.distortion: found a lens that is no pinhole; only those without distortion are built so far")
     watch = _Stopwatch()
     with watch.stage("NN_F"):
         banks = build_banks(scene, jobs, progress, dask)
