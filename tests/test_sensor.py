@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import copy
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -15,13 +17,17 @@ from test_lens import FISHEYE, WIDE
 from test_sensor_map import OFF, seen_through
 
 from build_model.export import export_model
+from build_model.verify.counterexample import Refuted
+from build_model.verify.lens_proof import check_lens
+from build_model.verify.proof import verify_model
 from runtime import Box, Estimator, FrameError, ModelError, Motion, Outcome, Scene, SceneError, Tracker
 from runtime.explanation import Reason, explain, shortfall
 from runtime.image import marking_images, runway_image
 from runtime.model.format import METADATA_KEY, metadata_digest
 from runtime.recordings.draw import draw_estimate
-from runtime.scene import Distortion, Tolerance
+from runtime.scene import Camera, Distortion, Tolerance
 from runtime.sensor_image import sensor_curves
+from runtime.sensor_map import lens_of
 
 CELLS = replace(PAPER, domain=replace(ONE_CELL.domain, x_m=PAPER.domain.x_m))
 SCENES = {
@@ -185,15 +191,21 @@ def test_what_the_lens_does_not_show_is_not_drawn() -> None:
 # --- damage ---
 
 
-def test_a_model_whose_ideal_frame_is_not_its_cameras_is_refused(folder: Path) -> None:
+def changed_model(folder: Path, change: Callable[[dict[str, Any]], dict[str, Any]]) -> Path:
+    """A model with other metadata, under a digest that agrees with them."""
     proto = onnx.load(model_of("wide", folder))
     (entry,) = [entry for entry in proto.metadata_props if entry.key == METADATA_KEY]
     stated = json.loads(entry.value)
-    for change in ({"ideal_pixels_a_pixel": 1}, {"ideal_camera": {**stated["ideal_camera"], "width": 75}}):
-        changed = {key: value for key, value in {**stated, **change}.items() if key != "metadata_sha256"}
-        entry.value = json.dumps({**changed, "metadata_sha256": metadata_digest(changed)}, sort_keys=True)
-        path = folder / "changed.onnx"
-        onnx.save(proto, path)
+    changed = {key: value for key, value in {**stated, **change(stated)}.items() if key != "metadata_sha256"}
+    entry.value = json.dumps({**changed, "metadata_sha256": metadata_digest(changed)}, sort_keys=True)
+    path = folder / f"changed-{metadata_digest(changed)[:12]}.onnx"
+    onnx.save(proto, path)
+    return path
+
+
+def test_a_model_whose_ideal_frame_is_not_its_cameras_is_refused(folder: Path) -> None:
+    narrower = changed_model(folder, lambda stated: {"ideal_camera": {**stated["ideal_camera"], "width": 75}})
+    for path in (narrower, changed_model(folder, lambda _stated: {"ideal_pixels_a_pixel": 1})):
         with pytest.raises(ModelError, match="its ideal frame is not the one that its camera has; export it again"):
             Estimator.load(path)
 
@@ -201,3 +213,44 @@ def test_a_model_whose_ideal_frame_is_not_its_cameras_is_refused(folder: Path) -
 def test_theorem_b_is_not_built_behind_a_lens(tmp_path: Path) -> None:
     with pytest.raises(SceneError, match=r"tolerance\.extra_budget: found 4; behind a lens only Theorem A holds"):
         export_model(replace(SCENES["wide"], tolerance=Tolerance(extra_budget=4)), tmp_path / "b.onnx", estimator="none")
+
+
+# --- the proof ---
+
+
+@pytest.mark.parametrize("name", ["wide", "two missed", "off", "cut"])
+def test_a_model_behind_a_lens_is_proved(name: str, folder: Path) -> None:
+    report = verify_model(model_of(name, folder))
+    assert report.proved, report.counterexample
+    assert report.cells == 1
+
+
+def test_an_ideal_frame_of_another_focal_length_is_refuted(folder: Path) -> None:
+    path = changed_model(folder, lambda stated: {"ideal_camera": {**stated["ideal_camera"], "focal_px": [540.0, 530.0]}})
+    assert "ideal_camera is no pinhole of the camera's own focal lengths" in str(verify_model(path).counterexample)
+    path = changed_model(folder, lambda _stated: {"ideal_pixels_a_pixel": 0})
+    assert "ideal_pixels_a_pixel is missing" in str(verify_model(path).counterexample)
+
+
+@pytest.mark.parametrize(
+    ("distortion", "proved"),
+    [
+        (WIDE, True),
+        (FISHEYE, True),
+        (Distortion("fisheye", (0.0, 0.0, 0.0, 0.0)), True),
+        (Distortion("radial-tangential", (-0.4, 0.0, 0.0, 0.0)), False),
+        (Distortion("radial-tangential", (0.0, 0.0, 0.2, 0.2)), False),
+        (Distortion("fisheye", (-0.6, 0.0, 0.0, 0.0)), False),
+    ],
+)
+def test_folds_are_found_in_balls_too(distortion: Distortion, proved: bool) -> None:
+    scene = seen_through(PAPER, distortion)
+    ideal = Camera(80, 300, focal_px=(scene.camera.focal_u_px, scene.camera.focal_v_px))
+    if proved:
+        check_lens(scene.camera, OFF, ideal)
+        assert lens_of(scene.camera, OFF).stretch > 0
+        return
+    with pytest.raises(Refuted, match="not proved to be free of folds"):
+        check_lens(scene.camera, OFF, ideal)
+    with pytest.raises(SceneError, match="folds within the frame"):
+        lens_of(scene.camera, OFF)
