@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rational_image import RationalState, RationalView
 
-from build_model.export import export_model
+from build_model.export import NO_ESTIMATOR, export_model
 from build_model.partition import partition
 from runtime import Scene
 from runtime.scene import Axis, Calibration, Camera, Distortion, EstimatorTraining, Runway, Tolerance
@@ -53,8 +53,10 @@ def derived_scene(scene: Scene, name: str) -> Scene:
 
 
 def seen_through(scene: Scene, name: str) -> Scene:
-    """The scene behind one of `LENSES`."""
+    """Up to two cells an axis, behind one of `LENSES`."""
     camera = scene.camera
+    axes = [few_cells(axis, first=number % 2 == 0) for number, axis in enumerate(scene.domain.axes)]
+    scene = replace(scene, domain=replace(scene.domain, theta_rad=axes[0], x_m=axes[1], y_m=axes[2], z_m=axes[3]))
     off = THROUGH_A_LENS_OFF if name.endswith("off") else Calibration()
     behind = Camera(
         camera.width,
@@ -69,7 +71,7 @@ def seen_through(scene: Scene, name: str) -> Scene:
 def build_model(scene: Scene, name: str, folder: Path, jobs: int) -> Path:
     """Writes one of `DERIVED` to `folder` and returns its path. The same scene and versions give the same file."""
     path = folder / f"coverage-{name.replace(', ', '-').replace(' ', '-')}.onnx"
-    export_model(derived_scene(scene, name), path, jobs=jobs)
+    export_model(derived_scene(scene, name), path, jobs=jobs, estimator=NO_ESTIMATOR if name in LENSES else None)
     return path
 
 
