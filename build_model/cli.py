@@ -93,11 +93,12 @@ def _planned(console: Console, path: Path, trained: bool, jobs: int, memory_mb: 
     """Reads the scene, prints what it takes to build, and refuses what takes more memory than it may, MB; returns both."""
     from build_model.build_size import build_size, check_size, free_memory_mb
     from runtime.scene import Scene, SceneError
+    from runtime.sensor import Sensor
 
     may_take = free_memory_mb() if memory_mb is None else memory_mb
     try:
         scene = Scene.load(path)
-        size = build_size(scene, jobs, trained)
+        size = build_size(Sensor.of(scene).ideal, jobs, trained)
         console.print(f"{path}: what it takes, estimated before anything is built")
         table = Table(show_header=False)
         for name, value in {**size.rows(), "memory that it may take": f"{may_take:.0f} MB"}.items():

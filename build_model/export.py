@@ -40,11 +40,13 @@ from build_model.paper.paper_bound import PaperBound, paper_bound
 from build_model.partition import partition
 from build_model.state_network import TrainingReport, domain_window, state_graph, train_state_network
 from build_model.user_network import bare, user_network
+from build_model.window import Bits
 from build_model.window_bank import CellWindows, cell_windows
 from runtime.assumptions import assumptions
 from runtime.model.format import FORMAT_VERSION, IR_VERSION, METADATA_KEY, NETWORK_OUTPUT, NETWORK_PREFIX, OPSET, metadata_digest
 from runtime.rounding import OUTWARD_PX
 from runtime.scene import Scene, WindowedBank
+from runtime.sensor import Sensor
 from runtime.whole_file import write_whole
 
 Progress = Callable[[str, int, int, float | None], None]
@@ -113,19 +115,21 @@ def export_model(
     used, OSError if the file cannot be written.
     """
     watch = _Stopwatch()
+    sensor = Sensor.of(scene)
+    ideal = sensor.ideal
     with watch.stage("NN_F"):
-        if not scene.calibration.exact:
-            check_calibration(scene, domain_window(scene))  # of the tables' window again below: this spares a build in vain
-        banks = build_banks(scene, jobs, progress, dask, memory_mb)
-        tables = assemble(scene, banks)
-        shift_px = check_calibration(scene, tables.window)
-        filter_part = filter_graph(scene, tables)
+        if not ideal.calibration.exact:
+            check_calibration(ideal, domain_window(ideal))  # of the tables' window again below: this spares a build in vain
+        banks = build_banks(ideal, jobs, progress, dask, memory_mb, sensor.unseen)
+        tables = assemble(ideal, banks)
+        shift_px = check_calibration(ideal, tables.window)
+        filter_part = filter_graph(ideal, tables)
     with watch.stage("NN_e"):
-        network, report = _state_network(scene, filter_part, estimator, seed, progress)
+        network, report = _state_network(ideal, filter_part, estimator, seed, progress)
     with watch.stage("file"):
         graph = _joined(filter_part, network)
-        bounds = paper_bounds(scene, jobs, dask)
-        content = _serialised(graph, _metadata(scene, tables, graph, shift_px, bounds, report, seed))
+        bounds = paper_bounds(ideal, jobs, dask)
+        content = _serialised(graph, _metadata(sensor, tables, graph, shift_px, bounds, report, seed))
         write_whole(Path(path), content)
     return ExportReport(
         cells=len(banks),
@@ -142,18 +146,24 @@ def export_model(
 
 
 def build_banks(
-    scene: Scene, jobs: int = 1, progress: Progress = _silent, dask: str | None = None, memory_mb: float | None = None
+    scene: Scene,
+    jobs: int = 1,
+    progress: Progress = _silent,
+    dask: str | None = None,
+    memory_mb: float | None = None,
+    unseen: Bits | None = None,
 ) -> list[CellBank] | list[CellWindows]:
     """S, entries, and O and K or windows of every cell, in the order of the partition.
 
-    Cells are independent: `jobs` local processes build them, or the workers of the dask.distributed scheduler at the address `dask`,
-    who must have the same version of this package; cells of a worker that is lost are built by another one. Raises `ClusterError`, and
-    `BuildTooLargeError` where the tables of the cells will take more than `memory_mb`, or memory runs out.
+    Pixels that are `unseen`, (height, width), and so lit in any frame, are in no K and in no window. Cells are independent: `jobs` local
+    processes build them, or the workers of the dask.distributed scheduler at the address `dask`, who must have the same version of this
+    package; cells of a worker that is lost are built by another one. Raises `ClusterError`, and `BuildTooLargeError` where the tables
+    of the cells will take more than `memory_mb`, or memory runs out.
     """
     cells = partition(scene)
     ledger = None if memory_mb is None else Ledger(len(cells), memory_mb)
     build = cell_windows if isinstance(scene.bank, WindowedBank) else cell_bank
-    work = (joblib.delayed(build)(scene, lower, upper) for lower, upper in zip(cells.lower, cells.upper, strict=True))
+    work = (joblib.delayed(build)(scene, lower, upper, unseen) for lower, upper in zip(cells.lower, cells.upper, strict=True))
     banks = []
     with _workers(jobs, dask):
         for bank in joblib.Parallel(return_as="generator")(work):
@@ -245,7 +255,7 @@ def _joined(filter_part: onnx.GraphProto, network: onnx.GraphProto) -> onnx.Grap
 
 
 def _metadata(
-    scene: Scene,
+    sensor: Sensor,
     tables: BankTables,
     graph: onnx.GraphProto,
     shift_px: float,
@@ -253,7 +263,11 @@ def _metadata(
     report: TrainingReport | None,
     seed: int,
 ) -> dict[str, Any]:
+    scene, through = sensor.scene, {}
+    if sensor.map is not None:
+        through = {"ideal_camera": sensor.ideal.to_dict()["camera"], "ideal_pixels_a_pixel": sensor.pixels_a_pixel}
     return {
+        **through,
         "format_version": FORMAT_VERSION,
         "scene": scene.to_dict(),
         "graph_sha256": hashlib.sha256(graph.SerializeToString(deterministic=True)).hexdigest(),

@@ -170,11 +170,13 @@ class CellMasks:
     upper: NDArray[np.float64]
     spatial: Bits
     window: Window
+    unseen: Bits | None
+    """Pixels of the frame that are lit in any, and so in no K."""
 
     @staticmethod
-    def of(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> CellMasks:
+    def of(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64], unseen: Bits | None = None) -> CellMasks:
         """The cell [lower, upper] and its S."""
-        return CellMasks(scene, lower, upper, *spatial_filter(scene, lower, upper))
+        return CellMasks(scene, lower, upper, *spatial_filter(scene, lower, upper), unseen)
 
     def strong_entries(self, lines: LineBoxes) -> Entries:
         """The entries of some boxes, those that would pass on any frame halved until their parts are stronger.
@@ -214,17 +216,19 @@ class CellMasks:
         scene, line_px = self.scene, self.scene.tolerance.line_px
         may_light = widened(scene, columns_that_may_be_lit(scene, states, line_px), line_px)
         may_light = runs_of(paint(may_light, self.window) & self.spatial, self.window)
-        must_light = inset(scene, columns_that_must_be_lit(scene, states), line_px)
-        return runs_of(paint(must_light, self.window), self.window), may_light
+        must_light = paint(inset(scene, columns_that_must_be_lit(scene, states), line_px), self.window)
+        if self.unseen is not None:
+            must_light &= ~self.unseen[self.window.slices]
+        return runs_of(must_light, self.window), may_light
 
 
-def cell_bank(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> CellBank:
-    """S, entries, O and K of the cell [lower, upper], both (4,).
+def cell_bank(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64], unseen: Bits | None = None) -> CellBank:
+    """S, entries, O and K of the cell [lower, upper], both (4,). Of K are left out the pixels, (height, width), that are lit in any frame.
 
     Boxes without a state of the cell are dropped, if proved so. An entry with |K| <= missed_budget would pass on any frame: it is halved
     until its parts are stronger. Raises `SceneError` where `HALVINGS` do not get there.
     """
-    cell = CellMasks.of(scene, lower, upper)
+    cell = CellMasks.of(scene, lower, upper, unseen)
     entries = cell.strong_entries(line_boxes(scene, lower, upper))
     return CellBank(
         lines=entries.lines,

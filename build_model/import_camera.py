@@ -258,7 +258,8 @@ def _size(tables: dict[str, Any]) -> tuple[int, int] | None:
 def _pair(key: str, value: Any) -> tuple[int, int]:
     """Width and height, from a list or a table."""
     sides = [value.get("width"), value.get("height")] if isinstance(value, dict) else value
-    _demand(isinstance(sides, list) and len(sides) == 2, key, value, "give the width and the height")
+    if not isinstance(sides, list) or len(sides) != 2:
+        raise CalibrationFileError(f"{key}: found {value!s:.120}; give the width and the height")
     width, height = (_number(key, side) for side in sides)
     _demand(width == int(width) and height == int(height), key, value, "give whole numbers of pixels")
     return int(width), int(height)

@@ -90,6 +90,8 @@ class Spans:
 
     first: Integers
     last: Integers
+    unseen: Bits | None = None
+    """Pixels of the frame that are lit in any, and so in no window, (height, width)."""
 
     @property
     def pixels(self) -> int:
@@ -128,13 +130,13 @@ def windowed_bank(scene: Scene) -> WindowedBank:
     return scene.bank
 
 
-def cell_windows(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> CellWindows:
-    """Groups, entries, windows and S of the cell [lower, upper], both (4,).
+def cell_windows(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64], unseen: Bits | None = None) -> CellWindows:
+    """Groups, entries, windows and S of the cell [lower, upper], both (4,). No window has pixels, (height, width), that are lit in any frame.
 
     A group that would pass on any frame, since it or one of its entries has no more windows than `missed_budget`, is halved until its
     parts are stronger. Raises `SceneError` where `HALVINGS` do not get there.
     """
-    spans, missed = _spans(scene, lower, upper), scene.tolerance.missed_budget
+    spans, missed = _spans(scene, lower, upper, unseen), scene.tolerance.missed_budget
     parts = [_groups(scene, group_boxes(scene, lower, upper), lower, upper, spans)]
     for halving in range(HALVINGS):
         weak = parts[-1].weak(missed)
@@ -307,6 +309,8 @@ def _windows_of_block(scene: Scene, sets: StateSet, spans: Spans) -> Windows:
     border = np.arange(1, height)
     usable &= (border % 2 == 0) & (border > margin) & (border < height - margin)
     usable &= (first > margin) & (last < width - 1 - margin) & (first <= last) & (last - first < WIDEST_WINDOW)
+    if spans.unseen is not None:
+        usable &= ~_meets(spans.unseen, border, first, last, usable)
     usable = _apart(usable, first, last, np.argsort(scene.runway.x_m, kind="stable"))
     seen = usable.any(axis=1)
     rank, count = seen.cumsum(axis=1), np.maximum(seen.sum(axis=1, keepdims=True), rows)
@@ -321,6 +325,16 @@ def _windows_of_block(scene: Scene, sets: StateSet, spans: Spans) -> Windows:
     return Windows(*(part.reshape(len(sets), -1) for part in (borders, firsts, lasts)))
 
 
+def _meets(pixels: Bits, border: Integers, first: Integers, last: Integers, which: Bits) -> Bits:
+    """True for those windows, of which `which` is True, that have one of the pixels, (sets, markings, borders)."""
+    sums = np.pad(np.cumsum(pixels[:-1] | pixels[1:], axis=1), ((0, 0), (1, 0)))  # of both rows of each border
+    number, marking, at = np.nonzero(which)
+    left, right = first[number, marking, at] - 1, last[number, marking, at] + 2
+    met = np.zeros_like(which)
+    met[number, marking, at] = sums[border[at] - 1, right] > sums[border[at] - 1, left]
+    return met
+
+
 def _apart(usable: Bits, first: Integers, last: Integers, order: Integers) -> Bits:
     """`usable` (sets, markings, borders) without the windows that share a pixel with one to their left, in the order given."""
     kept, end = np.zeros_like(usable), np.full(usable[:, 0].shape, -2)
@@ -330,11 +344,11 @@ def _apart(usable: Bits, first: Integers, last: Integers, order: Integers) -> Bi
     return kept
 
 
-def _spans(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> Spans:
+def _spans(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64], unseen: Bits | None) -> Spans:
     """S of the cell: in each row, all columns between the first and the last that some state's marking can light, and `line_px` more."""
     line_px = scene.tolerance.line_px
     first, last = widened(scene, columns_that_may_be_lit(scene, slice_cell(scene, lower, upper), line_px), line_px)
-    return Spans(first.min(axis=0), last.max(axis=0))
+    return Spans(first.min(axis=0), last.max(axis=0), unseen)
 
 
 def _demand_strong(groups: _Groups, missed_budget: int) -> None:

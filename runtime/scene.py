@@ -366,14 +366,8 @@ class Scene:
         widest = math.pi / 2 - SMALLEST_ANGLE_AHEAD_RAD
         ahead = -widest <= flattest and steepest <= widest
         _demand(ahead, "domain", "a state with the runway behind the camera (Z <= 0)", "narrow theta_rad, y_m or z_m")
-        self._check_lens()
+        _demand(self.camera.mount in (None, Mount()), "camera.mount", "a camera that is turned in the aircraft", "only 0 is taken so far")
         self._check_margin(nearest, farthest)
-
-    def _check_lens(self) -> None:
-        advice = "only 0 is taken so far"
-        _demand(self.camera.mount in (None, Mount()), "camera.mount", "a camera that is turned in the aircraft", advice)
-        none = self.camera.distortion is None or self.camera.distortion.none
-        _demand(none, "camera.distortion", "a lens that is no pinhole", advice)
 
     def _check_margin(self, nearest: float, farthest: float) -> None:
         """The margin of `runtime.rounding` is twice float64's error on rows and columns in view, or more. Raises `SceneError`.

@@ -35,6 +35,7 @@ SHARED_WITH_VERIFIER = {
     "runtime.assumptions",  # words
     "runtime.domain",  # how a scene is divided into cells, which the verifier derives anew
     "runtime.errors",
+    "runtime.ideal",  # which scene the ideal frame has
     "runtime.model",
     "runtime.model.format",
     "runtime.model.limits",  # numbers
