@@ -79,7 +79,8 @@ def line_boxes(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float
     """Boxes that together cover the cell [lower, upper], both (4,): equal bins of theta, z and x, and of the scale as fine as needed."""
     boxes = []
     for theta, z, row, scale, lateral in _columns_of_boxes(scene, lower, upper):
-        for x, bins in zip(lateral, _scale_bins(scene, lateral, scale), strict=True):
+        for x in lateral:
+            bins = _scale_bins(scene, x, scale)
             sides = np.empty((len(bins), 4, 2))
             sides[:, 0], sides[:, 1], sides[:, 2], sides[:, 3] = theta, x, bins, z
             boxes.append((sides, np.full(len(bins), row)))
@@ -147,13 +148,12 @@ def _lowest_scale(scale: NDArray[np.float64]) -> float:
     return 2.0 ** (math.frexp(scale[0])[1] - 2)
 
 
-def _scale_bins(scene: Scene, x: NDArray[np.float64], scale: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
-    """For each bin of x, (bins, 2): intervals of the scale that cover `scale` (2,), above 0, (intervals, 2)."""
-    lowest = _lowest_scale(scale)
-    for step, first, last in zip(*_scale_borders(scene, x, scale), strict=True):
-        edges = np.arange(int(first), int(last) + 1) * step
-        edges[0] = max(edges[0], lowest)
-        yield np.stack([edges[:-1], edges[1:]], axis=-1)
+def _scale_bins(scene: Scene, x: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Intervals of the scale that cover `scale` (2,), above 0, for x in a bin (2,), as `_scale_borders` has them: (bins, 2)."""
+    (step,), (first,), (last,) = _scale_borders(scene, x[None], scale)
+    edges = np.arange(int(first), int(last) + 1) * step
+    edges[0] = max(edges[0], _lowest_scale(scale))
+    return np.stack([edges[:-1], edges[1:]], axis=-1)
 
 
 @dataclass(frozen=True)
