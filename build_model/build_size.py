@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from build_model.hough_bank import BATCH_BYTES, BYTES_A_ROW, CellBank, CellMasks, box_count, line_boxes
+from build_model.calibration import check_calibration
+from build_model.hough_bank import BATCH_BYTES, BYTES_A_ROW, CellBank, CellMasks, box_count, some_boxes
 from build_model.paper.paper_bound import paper_bound
 from build_model.partition import Partition, partition
 from build_model.pixel_mask import runs_of
@@ -32,6 +33,8 @@ MOST_CELLS = 10**6
 """More cells than this are refused without a look at them."""
 COUNTED_CELLS = 1000
 """Cells whose boxes are counted and whose windows are looked at; of more, so many at equal distances."""
+COUNTED_BINS = 40_000
+"""Bins of theta and z in all of these, or those of one cell."""
 SAMPLED_CELLS, SAMPLED_BOXES, SAMPLED_GROUPS = 8, 24, 200
 """Cells of which entries are made, and boxes of each, or groups in a bank of windows."""
 PROCESS_BYTES, WORKER_BYTES = 3.0e8, 1.5e8
@@ -112,16 +115,19 @@ class _Sample:
 def build_size(scene: Scene, jobs: int = 1, trained: bool = True) -> BuildSize:
     """The estimate; `trained`: NN_e is trained too. The counts and bytes are the same every time, the seconds this machine's.
 
-    Raises `SceneError` where a sampled entry shows that the scene has no certificate, and `BuildTooLargeError` for too many cells.
+    Raises `SceneError` where the calibration or a sampled entry shows that the scene has no certificate, and `BuildTooLargeError` for too
+    many cells.
     """
     if scene.domain.cell_count > MOST_CELLS:
         raise BuildTooLargeError(f"domain: found {scene.domain.cell_count} cells; give {MOST_CELLS} or fewer")
     cells = partition(scene)
-    counted = np.unique(np.linspace(0, len(cells) - 1, COUNTED_CELLS).astype(int))
     masks = isinstance(scene.bank, Bank)
+    bins = scene.bank.pitch_bins * scene.bank.distance_bins if isinstance(scene.bank, Bank) else 1
+    counted = np.unique(np.linspace(0, len(cells) - 1, max(1, min(COUNTED_CELLS, COUNTED_BINS // bins))).astype(int))
     count, parts = (box_count, 1) if masks else (group_count, 2 ** len(halved_axes(scene)))
     counts = parts * np.array([count(scene, cells.lower[cell], cells.upper[cell]) for cell in counted])
     window = reduce(Window.union, (spatial_window(scene, cells.lower[cell], cells.upper[cell]) for cell in counted))
+    check_calibration(scene, window)
     sample_of = _sample_of_masks if masks else _sample_of_windows
     samples = [sample_of(scene, cells.lower[cell], cells.upper[cell], window) for cell in _drawn(counted, counts)]
 
@@ -162,8 +168,9 @@ def _sample_of_masks(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np
     cell = CellMasks.of(scene, lower, upper)
     spatial_runs = len(runs_of(cell.spatial[None], cell.window).mask)
     between = time.perf_counter()
-    lines = line_boxes(scene, lower, upper)
-    some = lines[np.sort(np.random.default_rng(0).permutation(len(lines))[:SAMPLED_BOXES])]
+    boxes = box_count(scene, lower, upper)
+    numbers = np.unique(np.random.default_rng(0).integers(boxes, size=SAMPLED_BOXES)) if boxes > SAMPLED_BOXES else np.arange(boxes)
+    some = some_boxes(scene, lower, upper, numbers)
     entries = cell.strong_entries(some)
     end = time.perf_counter()
     folded = mirrored(entries.must_light, window) and mirrored(entries.may_light, window)

@@ -99,7 +99,7 @@ def _planned(console: Console, path: Path, trained: bool, jobs: int, memory_mb: 
     try:
         scene = Scene.load(path)
         size = build_size(Sensor.of(scene).ideal, jobs, trained)
-        console.print(f"{path}: what it takes, estimated before anything is built")
+        console.print(f"{path}: what it takes, estimated before anything is built", markup=False, highlight=False, soft_wrap=True)
         table = Table(show_header=False)
         for name, value in {**size.rows(), "memory that it may take": f"{may_take:.0f} MB"}.items():
             table.add_row(name, value)

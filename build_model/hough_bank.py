@@ -31,6 +31,8 @@ from runtime.rounding import float32_above, float32_below, inverted
 from runtime.scene import STATE_NAMES, Bank, Scene, SceneError
 from runtime.state_set import StateSet, contract, scale_range, tangent_of_row
 
+MOST_LATERAL_BINS = 10**6
+"""More bins of x in a cell are not made, nor counted."""
 BATCH_BYTES = 2**26
 """What the masks of the entries that are made together take at most, or those of one entry."""
 BYTES_A_ROW, BYTES_A_PIXEL = 64, 8
@@ -77,7 +79,8 @@ def line_boxes(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float
     """Boxes that together cover the cell [lower, upper], both (4,): equal bins of theta, z and x, and of the scale as fine as needed."""
     boxes = []
     for theta, z, row, scale, lateral in _columns_of_boxes(scene, lower, upper):
-        for x, bins in zip(lateral, _scale_bins(scene, lateral, scale), strict=True):
+        for x in lateral:
+            bins = _scale_bins(scene, x, scale)
             sides = np.empty((len(bins), 4, 2))
             sides[:, 0], sides[:, 1], sides[:, 2], sides[:, 3] = theta, x, bins, z
             boxes.append((sides, np.full(len(bins), row)))
@@ -94,6 +97,26 @@ def box_count(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float6
     return counts
 
 
+def some_boxes(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64], numbers: NDArray[np.int64]) -> LineBoxes:
+    """Those of the cell's `line_boxes` that have these numbers, ascending, without making the others."""
+    sides, rows, before = [], [], 0
+    for theta, z, row, scale, lateral in _columns_of_boxes(scene, lower, upper):
+        step, first, last = _scale_borders(scene, lateral, scale)
+        ends = before + np.cumsum(last - first).astype(np.int64)
+        here = numbers[(numbers >= before) & (numbers < ends[-1])]
+        at = np.searchsorted(ends, here, "right")
+        edge = last[at] - (ends[at] - here)
+        box = np.empty((len(here), 4, 2))
+        box[:, 0], box[:, 1], box[:, 3] = theta, lateral[at], z
+        lowest = np.where(edge == first[at], _lowest_scale(scale), 0)
+        box[:, 2] = np.stack([np.maximum(edge * step[at], lowest), (edge + 1) * step[at]], axis=-1)
+        sides.append(box)
+        rows.append(np.full(len(here), row))
+        before = int(ends[-1])
+    joined = np.concatenate(sides)
+    return LineBoxes(joined[:, :, 0], joined[:, :, 1], np.concatenate(rows))
+
+
 def _columns_of_boxes(
     scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]
 ) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float64], float, NDArray[np.float64], NDArray[np.float64]]]:
@@ -105,6 +128,9 @@ def _columns_of_boxes(
         row = reference_row(scene.camera, low, high, scene.runway.ends_z_m.mean())
         scale = np.array(scale_range(scene.camera, theta, np.array([lower[2], upper[2]]), tangent_of_row(scene.camera, row)))
         lateral_bins = max(1, math.ceil((upper[1] - lower[1]) * scale[1] / bank.lateral_px))
+        if lateral_bins > MOST_LATERAL_BINS:
+            found = f"found {bank.lateral_px}, which cuts x into {lateral_bins} bins a cell"
+            raise SceneError(f"bank.lateral_px: {found}; give more, or narrow domain.x_m, for {MOST_LATERAL_BINS} or fewer")
         yield theta, z, row, scale, sliced(lower[1], upper[1], lateral_bins)
 
 
@@ -117,13 +143,17 @@ def _scale_borders(scene: Scene, x: NDArray[np.float64], scale: NDArray[np.float
     return step, np.floor(scale[0] / step), np.ceil(scale[1] / step)
 
 
-def _scale_bins(scene: Scene, x: NDArray[np.float64], scale: NDArray[np.float64]) -> Iterator[NDArray[np.float64]]:
-    """For each bin of x, (bins, 2): intervals of the scale that cover `scale` (2,), above 0, (intervals, 2)."""
-    lowest = 2.0 ** (math.frexp(scale[0])[1] - 2)  # a quarter to a half of the smallest scale, where the edge is 0
-    for step, first, last in zip(*_scale_borders(scene, x, scale), strict=True):
-        edges = np.arange(int(first), int(last) + 1) * step
-        edges[0] = max(edges[0], lowest)
-        yield np.stack([edges[:-1], edges[1:]], axis=-1)
+def _lowest_scale(scale: NDArray[np.float64]) -> float:
+    """A quarter to a half of the smallest scale, where the first edge is 0."""
+    return 2.0 ** (math.frexp(scale[0])[1] - 2)
+
+
+def _scale_bins(scene: Scene, x: NDArray[np.float64], scale: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Intervals of the scale that cover `scale` (2,), above 0, for x in a bin (2,), as `_scale_borders` has them: (bins, 2)."""
+    (step,), (first,), (last,) = _scale_borders(scene, x[None], scale)
+    edges = np.arange(int(first), int(last) + 1) * step
+    edges[0] = max(edges[0], _lowest_scale(scale))
+    return np.stack([edges[:-1], edges[1:]], axis=-1)
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from build_model.build_size import (
     free_memory_mb,
 )
 from build_model.export import build_banks, export_model
-from build_model.hough_bank import CellBank, box_count, cell_bank, line_boxes
+from build_model.hough_bank import CellBank, box_count, cell_bank, line_boxes, some_boxes
 from build_model.partition import partition
 from build_model.spatial_filter import spatial_filter, spatial_window
 from build_model.window_bank import group_boxes, group_count
@@ -76,7 +76,12 @@ def test_boxes_are_counted_without_making_them(name: str) -> None:
     for cell in {0, len(cells) - 1}:
         sides = cells.lower[cell], cells.upper[cell]
         if isinstance(scene.bank, Bank):
-            assert box_count(scene, *sides) == len(line_boxes(scene, *sides))
+            boxes = line_boxes(scene, *sides)
+            assert box_count(scene, *sides) == len(boxes)
+            some = np.sort(np.random.default_rng(1).permutation(len(boxes))[:50])
+            made = some_boxes(scene, *sides, some)
+            for name_of_part in ("lower", "upper", "reference_row"):
+                assert np.array_equal(getattr(made, name_of_part), getattr(boxes[some], name_of_part))
         else:
             assert group_count(scene, *sides) == len(group_boxes(scene, *sides))
 

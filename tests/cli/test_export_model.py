@@ -205,8 +205,37 @@ def test_ctrl_c_leaves_the_old_model(run: Run, scene_file: Path, tmp_path: Path,
     assert models_in(tmp_path) == {"model.onnx"}
 
 
+def test_a_dry_run_tells_what_a_scene_takes_and_builds_nothing(run: Run, scene_file: Path, tmp_path: Path) -> None:
+    result = run(scene_file.name, "--dry-run")
+    assert result.returncode == 0, result.stderr
+    assert result.stderr == ""
+    for text in (
+        "cells",
+        "boxes",
+        "entries, about",
+        "memory, at most about",
+        "file, about",
+        "NN_F, seconds, about",
+        "NN_e, seconds, about",
+    ):
+        assert text in result.stdout
+    assert "NN_e" not in run(scene_file.name, "--dry-run", "--estimator", "none").stdout
+    assert models_in(tmp_path) == set()
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_build_of_more_memory_than_it_may_take_is_one_line(run: Run, scene_file: Path, tmp_path: Path) -> None:
+    for also in ([], ["--dry-run"]):
+        result = run(scene_file.name, "--memory-mb", 200, *also)
+        assert "memory that it may take" in result.stdout
+        fails_with(result, "--memory-mb: found 200; give ", "or more, or fewer --jobs")
+    scene_file.write_text(ONE_CELL.replace("x_m = { centres = [0.0], width = 0.0 }", "x_m = { centres = [0.0], width = 40.0 }"))
+    fails_with(run(scene_file.name, "--memory-mb", 2000, "--jobs", 1), "domain.x_m: x spans 40 m", "narrow it to about")
+    assert models_in(tmp_path) == set()
+
+
 def test_help_names_every_option(run: Run) -> None:
     result = run("--help")
     assert result.returncode == 0
-    for option in ("--output", "-o", "--estimator", "--seed", "--jobs"):
+    for option in ("--output", "-o", "--estimator", "--seed", "--jobs", "--memory-mb", "--dry-run"):
         assert option in result.stdout
