@@ -61,12 +61,19 @@ out/paper.onnx: models/paper.toml constraints.txt $(SOURCES) | $(INSTALLED)
 	mkdir -p $(@D)
 	$(BIN)/export-model $< -o $@
 
-evidence: out/paper.onnx test-lowest
+out/approach.onnx out/drone.onnx: out/%.onnx: models/%.toml $(INSTALLED)
+	$(BIN)/export-model $< -o $@ --estimator none
+
+evidence: out/paper.onnx out/approach.onnx out/drone.onnx test-lowest
 	$(BIN)/verify-model $<
+	$(BIN)/verify-model out/approach.onnx
+	$(BIN)/verify-model out/drone.onnx
 	$(BIN)/python -m pytest -m evidence
 	$(BIN)/python -m pytest --hypothesis-profile=long
 	$(BIN)/python scripts/fuzz.py $< --minutes 10 -o out/fuzz
 	$(BIN)/python scripts/coverage $< --frames 24000 -o out/coverage.json
+	$(BIN)/python scripts/coverage out/approach.onnx --frames 2400 -o out/coverage_approach.json
+	$(BIN)/python scripts/coverage out/drone.onnx --frames 2400 -o out/coverage_drone.json
 	$(BIN)/python scripts/random_scenes -o out/random_scenes.json
 	$(BIN)/python scripts/flights.py $< -o out/flights.json
 

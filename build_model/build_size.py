@@ -25,7 +25,7 @@ from build_model.pixel_mask import runs_of
 from build_model.run_table import mirrored
 from build_model.spatial_filter import spatial_window
 from build_model.window import Window
-from build_model.window_bank import SETS_AT_ONCE, CellWindows, cell_windows, group_count, halved_axes
+from build_model.window_bank import CellWindows, cell_windows, group_count, halved_axes, sets_at_once
 from runtime.scene import STATE_NAMES, Bank, Scene, SceneError
 
 MB = 1e6
@@ -201,7 +201,7 @@ def _sample_of_windows(scene: Scene, lower: NDArray[np.float64], upper: NDArray[
         cell_bytes=4.0 * markings * window.shape[0],
         box_bytes=bank.exists.size * (5 * places + FILE_BYTES_AN_ENTRY) + len(bank.exists) * 8 * places,
         layout_bytes=bank.exists.size * (72 * places + BYTES_AN_ENTRY),
-        batch_bytes=SETS_AT_ONCE * BYTES_A_ROW * scene.camera.height * (1 + markings),
+        batch_bytes=sets_at_once(scene) * BYTES_A_ROW * scene.camera.height * (1 + markings),
         cell_seconds=0.0,
         box_seconds=seconds,
     )

@@ -48,8 +48,10 @@ FINEST_PX = 1.0
 """Steps are no smaller, however few rows the runway spans."""
 HALVED_AXES = 3
 """A group is halved along as many line coordinates, the scale first, into its entries."""
-SETS_AT_ONCE = 256
-"""Sets whose columns are bounded at once: memory is bounded."""
+MOST_AT_ONCE = 2**19
+"""Columns of markings at borders that are bounded at once, about: memory is bounded."""
+MOST_GROUPS = 2**16
+"""Groups of a cell; the scene that asks for more is refused."""
 
 Integers = NDArray[np.int64]
 
@@ -194,6 +196,7 @@ def group_boxes(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.floa
     boxes = []
     for theta, z, row, lateral, scales in _columns_of_boxes(scene, lower, upper):
         boxes += [(theta, x, bin_, z, row) for x in lateral for bin_ in scales]
+        _demand_few(scene, len(boxes))
     sides = np.array([[theta, x, scale, z] for theta, x, scale, z, _ in boxes])
     return LineBoxes(sides[:, :, 0], sides[:, :, 1], np.array([row for *_, row in boxes]))
 
@@ -210,6 +213,7 @@ def _columns_of_boxes(scene: Scene, lower: NDArray[np.float64], upper: NDArray[n
     camera, near_m = scene.camera, scene.runway.ends_z_m.min()
     moved_by_z = camera.focal_v_px * upper[2] * (1 / (lower[3] + near_m) - 1 / (upper[3] + near_m))
     z_bins, theta_bins = _bins(moved_by_z, steps["z"]), _bins(camera.focal_v_px * (upper[0] - lower[0]), steps["theta"])
+    _demand_few(scene, theta_bins * z_bins)
     for theta, z in itertools.product(sliced(lower[0], upper[0], theta_bins), sliced(lower[3], upper[3], z_bins)):
         low, high = lower.copy(), upper.copy()
         (low[0], high[0]), (low[3], high[3]) = theta, z
@@ -218,6 +222,7 @@ def _columns_of_boxes(scene: Scene, lower: NDArray[np.float64], upper: NDArray[n
         x_bins = _bins((upper[1] - lower[1]) * scale.mean(), steps["x"])
         below_horizon_px = row - (camera.v0 - camera.focal_v_px * math.tan(theta.mean()))
         scales = _scale_bins(scene, scale, steps["scale"], below_horizon_px)
+        _demand_few(scene, x_bins * len(scales))
         yield theta, z, row, sliced(lower[1], upper[1], x_bins), scales
 
 
@@ -228,6 +233,12 @@ def step_px(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]
     return min(windowed_bank(scene).set_px, max(float((near - far).max()) / ROWS_A_STEP, FINEST_PX))
 
 
+def _demand_few(scene: Scene, groups: int) -> None:
+    if groups > MOST_GROUPS:
+        set_px, most = windowed_bank(scene).set_px, f"more than the {MOST_GROUPS} that are built"
+        raise SceneError(f"bank.set_px: found {set_px}, with which a cell has {groups} groups or more, {most}; give more, or smaller cells")
+
+
 def _bins(moved_px: float, step: float) -> int:
     return max(1, math.ceil(moved_px / step))
 
@@ -236,7 +247,8 @@ def _scale_bins(scene: Scene, scale: NDArray[np.float64], step: float, below_hor
     """Intervals that cover the scales `scale` (2,), above 0: (bins, 2), growing by a ratio that moves near rows and columns by a step."""
     lever_m = max(float(np.abs(scene.runway.x_m).max()), SMALLEST_LEVER_M)
     share = step / max(lever_m * scale.mean(), below_horizon_px)
-    bins = max(1, math.ceil(math.log(scale[1] / scale[0]) / share))
+    bins = _bins(math.log(scale[1] / scale[0]), share)
+    _demand_few(scene, bins)
     edges = np.round(np.geomspace(scale[0], scale[1], bins + 1) / SCALE_STEP) * SCALE_STEP
     edges[0], edges[-1] = edges[0] - SCALE_STEP, edges[-1] + SCALE_STEP
     edges[0] = max(
@@ -269,13 +281,19 @@ def _without_states(sets: StateSet) -> Bits:
     return inverted(*sets.theta.T) | inverted(*sets.y.T)
 
 
+def sets_at_once(scene: Scene) -> int:
+    """How many sets' columns are bounded at once."""
+    return max(MOST_AT_ONCE // (len(scene.runway.markings) * scene.camera.height), 1)
+
+
 def must_hit_windows(scene: Scene, sets: StateSet, spans: Spans) -> Windows:
     """Windows of every set at `bank.rows` borders, spread over every other one of those that all of its states cross.
 
     The pixels by their two rows, a column more on both sides, lie in the frame, `line_px` from its border, beyond which a witness could
     lie; no two windows of a set share one. Where those of two markings meet, the left one is kept.
     """
-    blocks = [sets[first : first + SETS_AT_ONCE] for first in range(0, len(sets), SETS_AT_ONCE)]
+    size = sets_at_once(scene)
+    blocks = [sets[first : first + size] for first in range(0, len(sets), size)]
     if not blocks:
         places = windowed_bank(scene).rows * len(scene.runway.markings)
         return Windows(*(np.zeros((0, places), dtype=np.int64) for _ in range(3)))

@@ -24,7 +24,10 @@ EXTRAS = (
 )
 """Import names of what the embedded runtime must do without."""
 SHARED_WITH_VERIFIER = {
-    "build_model.filter_graph",  # the writer of the graph that the file's tables demand
+    "build_model.filter_graph",  # the writer of the graph that the file's tables demand, with its parts
+    "build_model.bank_graph",
+    "build_model.mask_graph",
+    "build_model.window_graph",
     "build_model.filter_tables",  # what the graph is made of
     "build_model.partition",  # what a list of cells is; the verifier makes its own
     "build_model.window",

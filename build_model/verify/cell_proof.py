@@ -27,7 +27,7 @@ from runtime.model.format import PADDING_SIZE
 
 @dataclass
 class CellProof:
-    """What was proved of a cell: numbers of entries, pixels in S, all O and all K, windows; and the least margin of a bound on a column, px."""
+    """What was proved of a cell: numbers of entries, pixels in S, all O and all K, windows; and a column's least margin, px."""
 
     entries: int = 0
     spatial_pixels: int = 0

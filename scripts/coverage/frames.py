@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from rational_image import Frame, RationalState, RationalView
 
 from build_model.hough_bank import CellBank, cell_bank
+from build_model.window_bank import CellWindows, cell_windows
 from coverage.states import Rng, Stage, image_of, into_domain, spatial_mask
 from runtime.frames import events_to_frames
 from runtime.recordings.recording import read_events
+from runtime.scene import WindowedBank
 
 Pixels = NDArray[np.int64]
 """Numbers of pixels in the flattened frame, in the order in which they go dark."""
@@ -30,11 +32,12 @@ def recorded_frames(path: str, shape: tuple[int, int]) -> NDArray[np.bool_]:
 
 
 @functools.cache
-def bank_of(path: str, cell: int) -> CellBank:
-    """The bank of one cell, built anew: its K say which pixels hurt most."""
+def bank_of(path: str, cell: int) -> CellBank | CellWindows:
+    """The bank of one cell, built anew: its K, or its windows, say which pixels hurt most."""
     scene = Stage.of(path, None).scene
     cells = Stage.of(path, None).cells
-    return cell_bank(scene, cells.lower[cell], cells.upper[cell])
+    build = cell_windows if isinstance(scene.bank, WindowedBank) else cell_bank
+    return build(scene, cells.lower[cell], cells.upper[cell])
 
 
 @dataclass
@@ -121,7 +124,7 @@ def row_band(rng: Rng, picture: Picture) -> Pixels:
 
 
 def must_light(rng: Rng, picture: Picture) -> Pixels:
-    """Pixels of K of an entry that holds the state, which leave that entry nothing to spare."""
+    """Pixels of K, or of the windows, of an entry that holds the state, which leave that entry nothing to spare."""
     stage, state = picture.stage, picture.states[0]
     bank = bank_of(stage.path, int(rng.choice(stage.cells_of(state))))
     theta, x, y, z = state.floats
@@ -129,11 +132,22 @@ def must_light(rng: Rng, picture: Picture) -> Pixels:
     scale = stage.scene.camera.focal_u_px * (np.cos(theta) * tangent + np.sin(theta)) / y
     line = np.stack([np.full_like(scale, theta), np.full_like(scale, x), scale, np.full_like(scale, z)], axis=-1)
     holding = np.flatnonzero(((bank.lines.lower - 1e-9 <= line) & (line <= bank.lines.upper + 1e-9)).all(axis=1))
-    must, runs = np.zeros_like(picture.runway), bank.must_light
-    for run in np.flatnonzero(runs.mask == rng.choice(holding)) if len(holding) else ():
-        must[runs.start[run] : runs.stop[run], runs.column[run]] = True
+    must = pixels_asked_for(bank, int(rng.choice(holding)), picture.runway.shape) if len(holding) else np.zeros_like(picture.runway)
     lit = image_of(picture.camera, state)
     return rng.permutation(lit.flat[must[lit.rows, lit.columns]])
+
+
+def pixels_asked_for(bank: CellBank | CellWindows, entry: int, shape: tuple[int, ...]) -> Frame:
+    """K of an entry, or the rows on both sides of its windows."""
+    must = np.zeros(shape, dtype=bool)
+    if isinstance(bank, CellWindows):
+        for border, first, last in zip(bank.windows.border[entry], bank.windows.first[entry], bank.windows.last[entry], strict=True):
+            must[border - 1 : border + 1, first - 1 : last + 2] |= first <= last
+        return must
+    runs = bank.must_light
+    for run in np.flatnonzero(runs.mask == entry):
+        must[runs.start[run] : runs.stop[run], runs.column[run]] = True
+    return must
 
 
 def put_out(picture: Picture, order: Pixels, missed: int) -> None:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+import functools
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from rational_image import RationalState, RationalView
 
+from build_model.calibration import displacement_px
 from build_model.export import export_model
 from build_model.partition import partition
+from build_model.spatial_filter import spatial_filter
+from build_model.window import Window
 from runtime import Scene
 from runtime.domain import AnyAxis, Axis, Domain, Edges
 from runtime.scene import Calibration, EstimatorTraining, Runway, Tolerance
@@ -36,10 +40,19 @@ def derived_scene(scene: Scene, name: str) -> Scene:
     """The scene of one of `DERIVED`."""
     exact = replace(scene, estimator=UNTRAINED, calibration=Calibration(), tolerance=Tolerance())
     if name == "tolerant":
-        return replace(exact, calibration=OFF_BY, tolerance=Tolerance(line_px=1))
+        return replace(exact, calibration=off_by_a_pixel(exact), tolerance=Tolerance(line_px=1))
     side, _, also = name.removeprefix("cut ").partition(", ")
     cut = staggered_scene(exact, above=name == BARELY[0]) if name in BARELY else cut_scene(exact, side)
     return replace(cut, calibration=SHIFTED, tolerance=Tolerance(line_px=1)) if also or name in BARELY else cut
+
+
+def off_by_a_pixel(scene: Scene) -> Calibration:
+    """`OFF_BY`, or a half, a quarter and so on of it, so that it moves no marking by more than a pixel."""
+    window = functools.reduce(Window.union, (spatial_filter(scene, *cell)[1] for cell in zip(*scene.domain.cells(), strict=True)))
+    off = OFF_BY
+    while displacement_px(replace(scene, calibration=off), window) > 1:
+        off = Calibration(*(getattr(off, field.name) / 2 for field in fields(Calibration)))
+    return off
 
 
 def build_model(scene: Scene, name: str, folder: Path, jobs: int) -> Path:

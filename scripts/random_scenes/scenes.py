@@ -15,11 +15,12 @@ import numpy as np
 
 from build_model.calibration import displacement_px
 from build_model.pixel_mask import Window
+from build_model.window_bank import group_boxes
 from random_scenes.divisions import EQUAL, Division, draw_division, stretch_of
 from random_scenes.sights import PLACES, Floats, Rng, Sight, UndrawableError, draw_camera, mirrored
 from runtime.camera import ground_scale, project, row_of_point
 from runtime.domain import Domain, Edges, Growth
-from runtime.scene import STATE_NAMES, Bank, Calibration, EstimatorTraining, Marking, Runway, Scene, SceneError, Tolerance
+from runtime.scene import STATE_NAMES, Bank, Calibration, EstimatorTraining, Marking, Runway, Scene, SceneError, Tolerance, WindowedBank
 
 FARTHEST_SHIFT_M = 1e5
 MOST_CELLS, MOST_OF_AN_AXIS = 81, 3
@@ -30,6 +31,10 @@ MOST_AT_ONCE = 1e8
 """The same of one cell, which are in memory together."""
 MOST_ROWS = 1.5e7
 """Limit on the rows that a bank encloses, in all slices and entries and markings."""
+WINDOWED_SHARE = 1 / 3
+"""Share of the scenes that have a bank of windows."""
+MOST_GROUPS = 600
+"""Limit on its groups: a second or two."""
 MANY_BINS, FEW_BINS = (6, 9, 20, 5), (2, 2, 5, 3)
 """Bins of theta, x, scale and z stay below these."""
 ENOUGH_BINS = 8
@@ -317,8 +322,25 @@ def draw_once(rng: Rng) -> DrawnScene:
     while not plan.affordable(scene):
         plan = plan.coarser()
         scene = setting.scene(sight, plan, tolerance)
+    scene = in_windows(rng.spawn(1)[0], scene, sight, plan, setting)
     scene = replace(scene, calibration=draw_calibration(rng, scene))
     return DrawnScene(scene, (place, *kinds_of(scene, setting)))
+
+
+def in_windows(rng: Rng, scene: Scene, sight: Sight, plan: Plan, setting: Setting) -> Scene:
+    """One scene of three with a bank of windows, over a domain up to 16 times as wide on each axis, if that can be built quickly."""
+    bank = WindowedBank(float(10 ** rng.uniform(0.3, 2)), int(rng.integers(3, 25)), int(10 ** rng.uniform(0, 2.5)))
+    if rng.random() > WINDOWED_SHARE:
+        return scene
+    for factor in (16 ** rng.uniform(0, 1), 1.0):
+        try:
+            wide = replace(setting.scene(sight, replace(plan, steps=plan.steps * factor), scene.tolerance), bank=bank)
+            lower, upper = wide.domain.cells()
+            if sum(len(group_boxes(wide, *cell)) for cell in zip(lower, upper, strict=True)) <= MOST_GROUPS:
+                return wide
+        except SceneError:
+            continue
+    return scene
 
 
 def kinds_of(scene: Scene, setting: Setting) -> list[str]:
@@ -338,6 +360,7 @@ def kinds_of(scene: Scene, setting: Setting) -> list[str]:
         "unlike edges": any(isinstance(axis, Edges) and len(axis.edges) > 2 for axis in domain.axes),
         "cells by a ratio": any(isinstance(axis, Growth) for axis in domain.axes),
         "glide": domain.glide is not None,
+        "bank of windows": isinstance(scene.bank, WindowedBank),
         "coordinates above 1 km": max(abs(setting.across_m), abs(setting.along_m)) > 1000,
         "frame below 10,000 px": pixels < 1e4,
         "frame above 1,000,000 px": pixels > 1e6,
