@@ -277,11 +277,14 @@ def _sensor_rays(turn: Turn, x: Interval, y: Interval) -> tuple[Interval, Interv
     sway = (turned_x + np.maximum(np.abs(middle_low), np.abs(middle_high)) * turned_x) / near
     s = middle_low - sway, middle_high + sway
     t = np.minimum(y_low / near, y_low / distant), np.maximum(y_high / near, y_high / distant)
-    t_size, s_size = np.maximum(np.abs(t[0]), np.abs(t[1])), np.maximum(np.abs(s[0]), np.abs(s[1]))
-    rest_s = half_a * t_size + half_a**2 / 2 * s_size + 4 * ROUNDING_SHARE * (1 + s_size + t_size)
-    rest_t = half_a * s_size + half_a**2 / 2 * t_size + 4 * ROUNDING_SHARE * (1 + s_size + t_size)
-    column = _scaled(s, cosine_a)[0] + _scaled(t, -sine_a)[0] - rest_s, _scaled(s, cosine_a)[1] + _scaled(t, -sine_a)[1] + rest_s
-    row = _scaled(s, sine_a)[0] + _scaled(t, cosine_a)[0] - rest_t, _scaled(s, sine_a)[1] + _scaled(t, cosine_a)[1] + rest_t
+    # At the middle a; the rest of it, at most h, moves a coordinate by no more than h of the other there and h^2/2 of itself.
+    column = _scaled(s, cosine_a)[0] + _scaled(t, -sine_a)[0], _scaled(s, cosine_a)[1] + _scaled(t, -sine_a)[1]
+    row = _scaled(s, sine_a)[0] + _scaled(t, cosine_a)[0], _scaled(s, sine_a)[1] + _scaled(t, cosine_a)[1]
+    column_size, row_size = (np.maximum(np.abs(side[0]), np.abs(side[1])) for side in (column, row))
+    rounding = 8 * ROUNDING_SHARE * (1 + column_size + row_size)
+    column_rest = half_a * row_size + half_a**2 / 2 * column_size + rounding
+    row_rest = half_a * column_size + half_a**2 / 2 * row_size + rounding
+    column, row = (column[0] - column_rest, column[1] + column_rest), (row[0] - row_rest, row[1] + row_rest)
     return _where(seen, column), _where(seen, row)
 
 
