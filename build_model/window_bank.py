@@ -131,7 +131,7 @@ def windowed_bank(scene: Scene) -> WindowedBank:
 
 
 def cell_windows(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64], unseen: Bits | None = None) -> CellWindows:
-    """Groups, entries, windows and S of the cell [lower, upper], both (4,). Pixels that are lit in any frame, (height, width), are in no window.
+    """Groups, entries, windows and S of the cell [lower, upper], both (4,). Pixels lit in any frame, (height, width), are in no window.
 
     A group that would pass on any frame, since it or one of its entries has no more windows than `missed_budget`, is halved until its
     parts are stronger. Raises `SceneError` where `HALVINGS` do not get there.
