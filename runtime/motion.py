@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +27,20 @@ from runtime.turn import cosine_and_sine
 Floats = NDArray[np.float64]
 
 US_PER_S = 1e6
+SHORTEST_US = 1e-6
+"""What moves in a shorter time is bounded by what may move in up to this one: products of such times with rates have no digits left."""
+LATEST_US = 2**63
+"""Instants lie before this one, and after its negative: 300,000 years."""
 FLAT = 1e-9
 """A slope in delta of no more than so much of its terms counts as both up and down: far above float64's error, and sound either way."""
+
+
+def instant(time_us: float) -> int | Fraction:
+    """A time, of any of Python's or numpy's numbers, without rounding. Raises ValueError for one that is not finite."""
+    number = time_us.item() if isinstance(time_us, np.generic) else time_us
+    if not -LATEST_US < number < LATEST_US:
+        raise ValueError(f"time_us: found {time_us}; give a finite number of microseconds")
+    return number if isinstance(number, int) else Fraction(*number.as_integer_ratio())
 
 
 @dataclass(frozen=True)
@@ -46,7 +59,7 @@ class Displacement:
         lower, upper = self.lower.copy(), self.upper.copy()
         for name, (low, high) in intervals.items():
             axis = axis_number(name, "displacement")
-            if not low <= high:
+            if not (low <= high and low < np.inf and high > -np.inf):
                 raise ValueError(f"displacement: found {low} to {high} for {name}; give two ordered numbers")
             lower[axis], upper[axis] = low, high
         return Displacement(lower, upper)
@@ -77,7 +90,9 @@ class Motion:
         """How far the state moves in a time, which may be negative: back to what was before."""
         if elapsed_us == 0:
             return STANDSTILL
-        sides = np.stack([self.rate_lower, self.rate_upper]) * (elapsed_us / US_PER_S)
+        shortest = 0 < abs(elapsed_us) < SHORTEST_US
+        sides = np.stack([self.rate_lower, self.rate_upper]) * (np.copysign(SHORTEST_US, elapsed_us) if shortest else elapsed_us)
+        sides = np.concatenate([sides / US_PER_S, np.zeros((int(shortest), 4))])  # any part of that time, from none to all of it
         low, high = sides.min(axis=0), sides.max(axis=0)
         return Displacement(lowered(low, np.abs(low)), raised(high, np.abs(high)))
 
