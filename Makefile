@@ -68,7 +68,7 @@ evidence: out/paper.onnx test-lowest
 	$(BIN)/python scripts/fuzz.py $< --minutes 10 -o out/fuzz
 	$(BIN)/python scripts/coverage $< --frames 24000 -o out/coverage.json
 	$(BIN)/python scripts/random_scenes -o out/random_scenes.json
-	$(BIN)/python scripts/flights.py $< -o out/flights.json
+	$(BIN)/python scripts/flights $< -o out/flights.json
 
 clean:
 	rm -rf .venv .venv-lowest out dist build .pytest_cache .ruff_cache .hypothesis
