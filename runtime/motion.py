@@ -9,7 +9,8 @@ The scale g at the reference row moves with pitch and altitude. With psi the ang
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 
 from runtime.estimate import Box, axis_number
 from runtime.refine.altitude import contract_by_altitude
+from runtime.refine.refiner import joined
 from runtime.refine.slices import rereferenced, tangents_below_horizon
 from runtime.rounding import lowered, raised
 from runtime.scene import Camera, Scene
@@ -45,7 +47,7 @@ def instant(time_us: float) -> int | Fraction:
 
 @dataclass(frozen=True)
 class Displacement:
-    """Bounds on how far a state has moved, (4,) each; infinite where nothing is known."""
+    """Bounds on how far a state has moved, (4,) each, or (states, 4) of several; infinite where nothing is known."""
 
     lower: Floats
     upper: Floats
@@ -53,6 +55,10 @@ class Displacement:
     def __add__(self, other: Displacement) -> Displacement:
         """First the one, then the other: bounds rounded outward."""
         return Displacement(*moved_box(self.lower, self.upper, other))
+
+    def of(self, which: NDArray[np.bool_]) -> Displacement:
+        """Those of some of several states."""
+        return Displacement(self.lower[which], self.upper[which])
 
     def replaced(self, intervals: Mapping[str, tuple[float, float]]) -> Displacement:
         """Other bounds on the named axes. Raises ValueError for an axis of another name, and for bounds that are not ordered numbers."""
@@ -110,24 +116,32 @@ def moved_box(lower: Floats, upper: Floats, by: Displacement) -> tuple[Floats, F
 
 def moved(camera: Camera, sets: StateSet, by: Displacement, domain: Box) -> StateSet:
     """Sets that hold every state of the domain to which a state of `sets` can have moved; those that hold none are left out."""
-    low, high = moved_box(sets.lower, sets.upper, by)
+    return moved_each(camera, [sets], [by], domain)[0]
+
+
+def moved_each(camera: Camera, unions: Sequence[StateSet], by: Sequence[Displacement], domain: Box) -> list[StateSet]:
+    """`moved` of several unions of sets, each by its own displacement, at hardly more than the cost of one."""
+    if not unions:
+        return []
+    sets, union = joined(*unions), np.arange(len(unions)).repeat([len(each) for each in unions])
+    step = Displacement(*(np.stack([getattr(each, side) for each in by])[union] for side in ("lower", "upper")))
+    low, high = moved_box(sets.lower, sets.upper, step)
     low, high = np.maximum(low, domain.lower), np.minimum(high, domain.upper)
     inside = np.all(low <= high, axis=1)
-    sets, low, high = sets[inside], low[inside], high[inside]
-    if len(sets) == 0:
-        return sets
-    lowest = min(float(sets.theta[:, 0].min()), float(low[:, 0].min()))
-    sets = rereferenced(sets, tangents_below_horizon(camera, sets.tangent, lowest))
+    sets, union, step, low, high = sets[inside], union[inside], step.of(inside), low[inside], high[inside]
+    sets = rereferenced(sets, tangents_below_horizon(camera, sets.tangent, np.minimum(sets.theta[:, 0], low[:, 0])))
     theta, x, y, z = (np.stack([low[:, axis], high[:, axis]], axis=-1) for axis in range(4))
-    after = StateSet(theta, x, y, z, _moved_scale(sets, theta, y, by), sets.tangent)
+    after = StateSet(theta, x, y, z, _moved_scale(sets, theta, y, step), sets.tangent)
     after = contract_by_altitude(camera, after)
-    return after[~after.empty]
+    left = ~after.empty
+    after, borders = after[left], np.searchsorted(union[left], np.arange(len(unions) + 1))
+    return [after[start:stop] for start, stop in itertools.pairwise(borders.tolist())]
 
 
 def _moved_scale(sets: StateSet, theta: Floats, y: Floats, by: Displacement) -> Floats:
-    """The scales of sets whose pitch and altitude have moved into `theta` and `y`, (sets, 2) each, rounded outward."""
-    slow, fast = _turn(sets, _differences(sets.theta, theta, by.lower[0], by.upper[0]))
-    falls = _differences(sets.y, y, by.lower[2], by.upper[2])[:, None, :] / y[:, :, None]
+    """The scales of sets whose pitch and altitude have moved into `theta` and `y`, (sets, 2) each, rounded outward. `by`: (sets, 4)."""
+    slow, fast = _turn(sets, _differences(sets.theta, theta, by.lower[:, 0], by.upper[:, 0]))
+    falls = _differences(sets.y, y, by.lower[:, 2], by.upper[:, 2])[:, None, :] / y[:, :, None]
     shrinks, terms = 1 - falls, 1 + np.abs(falls)  # y/(y + epsilon) = 1 - epsilon/y'
     low = sets.scale[:, 0] * slow * np.maximum(lowered(shrinks, terms).min(axis=(1, 2)), 0)
     high = sets.scale[:, 1] * fast * raised(shrinks, terms).max(axis=(1, 2))
@@ -152,8 +166,8 @@ def _turn(sets: StateSet, delta: Floats) -> tuple[Floats, Floats]:
     return np.where(beyond, 0, slow), np.where(beyond, np.inf, fast)
 
 
-def _differences(before: Floats, after: Floats, low: float, high: float) -> Floats:
-    """How much a coordinate can have changed, (sets, 2), between `low` and `high`, from an interval into another, (sets, 2) each."""
+def _differences(before: Floats, after: Floats, low: Floats, high: Floats) -> Floats:
+    """How much a coordinate can have changed, (sets, 2), from an interval into another, (sets, 2) each, between `low` and `high`."""
     least, most = after[:, 0] - before[:, 1], after[:, 1] - before[:, 0]
     terms = np.abs(before).max(axis=1) + np.abs(after).max(axis=1)
     return np.stack([np.maximum(low, lowered(least, terms)), np.minimum(high, raised(most, terms))], axis=-1)

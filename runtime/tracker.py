@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 from runtime.assumptions import prior_assumption
 from runtime.estimate import Box, Estimate, Outcome
 from runtime.estimator import Estimator, Found
-from runtime.motion import STANDSTILL, Displacement, Motion, instant, moved, moved_box
+from runtime.motion import STANDSTILL, Displacement, Motion, instant, moved_box, moved_each
 from runtime.refine.refiner import joined
 from runtime.refine.regions import regions_of
-from runtime.refine.slices import all_but, covering, slice_edges, sliced, within
+from runtime.refine.slices import all_but, covering, slice_edges, sliced, sliced_each, within
 from runtime.state_set import StateSet
 
 
@@ -140,7 +140,7 @@ class Tracker:
 
     def _held(self) -> list[StateSet]:
         """For q = 0 to `outliers`: the states of the domain that lie in what all but q of the earlier frames leave possible now."""
-        parts = [moved(self._camera, seen.sets, seen.since, self._domain) for seen in self._earlier]
+        parts = moved_each(self._camera, [seen.sets for seen in self._earlier], [seen.since for seen in self._earlier], self._domain)
         if len(parts) == 1 and self.outliers == 0:
             return parts
         whole = covering(self._camera, self._domain, self._camera.v0)
@@ -153,7 +153,7 @@ class Tracker:
             return [whole[:0]] * (self.outliers + 1)
         edges = slice_edges(theta)
         tangent = max((float(np.median(part.tangent)) for part in parts if len(part)), default=float(whole.tangent[0]))
-        start, *sources = (sliced(self._camera, sets, edges, tangent) for sets in (whole, *parts))
+        start, *sources = sliced_each(self._camera, [whole, *parts], edges, tangent)
         return [sets[~sets.empty] for sets in all_but(sources, start, self.outliers)]
 
     def _followed(self, found: Found, left: StateSet, seen: StateSet, prior: Box | None) -> Estimate:
