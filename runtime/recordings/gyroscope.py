@@ -63,8 +63,8 @@ class GyroscopeReadings:
         """
         if not since_us < until_us:
             return 0.0, 0.0
-        inner = self.time_us[(self.time_us > since_us) & (self.time_us < until_us)]
-        edges = np.concatenate([[since_us], inner, [until_us]])
+        first, last = np.searchsorted(self.time_us, since_us, side="right"), np.searchsorted(self.time_us, until_us)
+        edges = np.concatenate([[since_us], self.time_us[first:last], [until_us]])
         seconds = np.diff(edges) / US_PER_S
         rates = self._between(np.searchsorted(self.time_us, edges[:-1], side="right") - 1, motion)
         sums, sizes = ([math.fsum(part) for part in each] for each in (rates * seconds, np.abs(rates) * seconds))
@@ -74,7 +74,7 @@ class GyroscopeReadings:
         """Bounds on theta's rate after each of the numbered readings until the next one, (2, n); the motion's where nothing is known."""
         rates = np.repeat([[motion.rate_lower[0]], [motion.rate_upper[0]]], len(reading), axis=1)
         within = (reading >= 0) & (reading < len(self.slowest))
-        read = np.stack([self.slowest, self.fastest])[:, reading[within]]
+        read = np.stack([side[reading[within]] for side in (self.slowest, self.fastest)])
         rates[:, within] = np.where(np.isfinite(read), read, rates[:, within])
         return rates
 
