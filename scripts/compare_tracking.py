@@ -104,7 +104,7 @@ def main(
         line_px, budget = estimator.scene.tolerance.line_px, estimator.missed_budget
         broken = [missed_pixels(estimator.scene, frame, state, line_px) > budget for _, frame, state in windows]
         ways: dict[str, tuple[Path | None, Path | None]] = {"over time": (None, None)}
-        ways |= {} if attitude is None else {"with the attitude reference": (attitude, None)}
+        ways |= {} if attitude is None else {"with the reference": (attitude, None)}
         ways |= {} if gyroscope is None else {"with the gyroscope": (None, gyroscope)}
         ways |= {} if attitude is None or gyroscope is None else {"with both": (attitude, gyroscope)}
         followers = {name: Follower.of(estimator, *files, motion, horizon, outliers) for name, files in ways.items()}

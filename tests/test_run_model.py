@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 pytest.importorskip("cv2", reason="the extra 'recordings' is not installed")
 pytest.importorskip("typer", reason="the extra 'recordings' is not installed")
 
+import compare_tracking
 import cv2
 import replay
 import typer
@@ -596,6 +597,27 @@ def test_a_gyroscope_makes_the_box_smaller_and_a_wrong_one_is_found(recording, t
     assert "within the plus-minus of" in " ".join(done.stdout.split())
     assert invoke(*options, "--gyroscope", gyroscope_file(tmp_path / "bad.csv", 3.0)).exit_code == 0
     assert "inconsistent" in {row["tracked_outcome"] for row in rows_of(tmp_path)}
+
+
+def test_ways_to_follow_a_recording_are_compared(recording, truth, tmp_path):
+    files = ["--attitude", attitude_file(tmp_path / "a.csv", 0.004), "--gyroscope", gyroscope_file(tmp_path / "g.csv", 0.015)]
+    app = typer.Typer()
+    app.command()(compare_tracking.main)
+    done = CliRunner().invoke(app, [*map(str, [MODEL, recording, truth, *files]), "--motion", MOTION])
+    assert done.exit_code == 0, done.output
+    rows = [line.split("│") for line in done.stdout.splitlines() if line.startswith("│")]
+    assert [row[1].strip() for row in rows] == [
+        "the frame alone",
+        "over time",
+        "with the reference",
+        "with the gyroscope",
+        "with both",
+    ]
+    assert [[int(cell) for cell in row[2:6]] for row in rows] == [[WINDOWS - 1, 1, 0, 0]] * len(rows)
+    theta = [float(row[6].split()[0]) for row in rows]
+    assert theta[4] <= theta[2] < theta[1] < theta[0]
+    broken = CliRunner().invoke(app, [str(MODEL), str(recording), str(tmp_path / "none.csv")])
+    assert (broken.exit_code, broken.stderr.count("\n")) == (2, 1)
 
 
 @pytest.mark.parametrize(
