@@ -9,14 +9,17 @@ The scale g at the reference row moves with pitch and altitude. With psi the ang
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
 
 from runtime.estimate import Box, axis_number
 from runtime.refine.altitude import contract_by_altitude
+from runtime.refine.refiner import joined
 from runtime.refine.slices import rereferenced, tangents_below_horizon
 from runtime.rounding import lowered, raised
 from runtime.scene import Camera, Scene
@@ -26,13 +29,25 @@ from runtime.turn import cosine_and_sine
 Floats = NDArray[np.float64]
 
 US_PER_S = 1e6
+SHORTEST_US = 1e-6
+"""What moves in a shorter time is bounded by what may move in up to this one: products of such times with rates have no digits left."""
+LATEST_US = 2**63
+"""Instants lie before this one, and after its negative: 300,000 years."""
 FLAT = 1e-9
 """A slope in delta of no more than so much of its terms counts as both up and down: far above float64's error, and sound either way."""
 
 
+def instant(time_us: float) -> int | Fraction:
+    """A time, of any of Python's or numpy's numbers, without rounding. Raises ValueError for one that is not finite."""
+    number = time_us.item() if isinstance(time_us, np.generic) else time_us
+    if not -LATEST_US < number < LATEST_US:
+        raise ValueError(f"time_us: found {time_us}; give a finite number of microseconds")
+    return number if isinstance(number, int) else Fraction(*number.as_integer_ratio())
+
+
 @dataclass(frozen=True)
 class Displacement:
-    """Bounds on how far a state has moved, (4,) each; infinite where nothing is known."""
+    """Bounds on how far a state has moved, (4,) each, or (states, 4) of several; infinite where nothing is known."""
 
     lower: Floats
     upper: Floats
@@ -41,12 +56,16 @@ class Displacement:
         """First the one, then the other: bounds rounded outward."""
         return Displacement(*moved_box(self.lower, self.upper, other))
 
+    def of(self, which: NDArray[np.bool_]) -> Displacement:
+        """Those of some of several states."""
+        return Displacement(self.lower[which], self.upper[which])
+
     def replaced(self, intervals: Mapping[str, tuple[float, float]]) -> Displacement:
         """Other bounds on the named axes. Raises ValueError for an axis of another name, and for bounds that are not ordered numbers."""
         lower, upper = self.lower.copy(), self.upper.copy()
         for name, (low, high) in intervals.items():
             axis = axis_number(name, "displacement")
-            if not low <= high:
+            if not (low <= high and low < np.inf and high > -np.inf):
                 raise ValueError(f"displacement: found {low} to {high} for {name}; give two ordered numbers")
             lower[axis], upper[axis] = low, high
         return Displacement(lower, upper)
@@ -77,7 +96,9 @@ class Motion:
         """How far the state moves in a time, which may be negative: back to what was before."""
         if elapsed_us == 0:
             return STANDSTILL
-        sides = np.stack([self.rate_lower, self.rate_upper]) * (elapsed_us / US_PER_S)
+        shortest = 0 < abs(elapsed_us) < SHORTEST_US
+        sides = np.stack([self.rate_lower, self.rate_upper]) * (np.copysign(SHORTEST_US, elapsed_us) if shortest else elapsed_us)
+        sides = np.concatenate([sides / US_PER_S, np.zeros((int(shortest), 4))])  # any part of that time, from none to all of it
         low, high = sides.min(axis=0), sides.max(axis=0)
         return Displacement(lowered(low, np.abs(low)), raised(high, np.abs(high)))
 
@@ -95,24 +116,32 @@ def moved_box(lower: Floats, upper: Floats, by: Displacement) -> tuple[Floats, F
 
 def moved(camera: Camera, sets: StateSet, by: Displacement, domain: Box) -> StateSet:
     """Sets that hold every state of the domain to which a state of `sets` can have moved; those that hold none are left out."""
-    low, high = moved_box(sets.lower, sets.upper, by)
+    return moved_each(camera, [sets], [by], domain)[0]
+
+
+def moved_each(camera: Camera, unions: Sequence[StateSet], by: Sequence[Displacement], domain: Box) -> list[StateSet]:
+    """`moved` of several unions of sets, each by its own displacement, at hardly more than the cost of one."""
+    if not unions:
+        return []
+    sets, union = joined(*unions), np.arange(len(unions)).repeat([len(each) for each in unions])
+    step = Displacement(*(np.stack([getattr(each, side) for each in by])[union] for side in ("lower", "upper")))
+    low, high = moved_box(sets.lower, sets.upper, step)
     low, high = np.maximum(low, domain.lower), np.minimum(high, domain.upper)
     inside = np.all(low <= high, axis=1)
-    sets, low, high = sets[inside], low[inside], high[inside]
-    if len(sets) == 0:
-        return sets
-    lowest = min(float(sets.theta[:, 0].min()), float(low[:, 0].min()))
-    sets = rereferenced(sets, tangents_below_horizon(camera, sets.tangent, lowest))
+    sets, union, step, low, high = sets[inside], union[inside], step.of(inside), low[inside], high[inside]
+    sets = rereferenced(sets, tangents_below_horizon(camera, sets.tangent, np.minimum(sets.theta[:, 0], low[:, 0])))
     theta, x, y, z = (np.stack([low[:, axis], high[:, axis]], axis=-1) for axis in range(4))
-    after = StateSet(theta, x, y, z, _moved_scale(sets, theta, y, by), sets.tangent)
+    after = StateSet(theta, x, y, z, _moved_scale(sets, theta, y, step), sets.tangent)
     after = contract_by_altitude(camera, after)
-    return after[~after.empty]
+    left = ~after.empty
+    after, borders = after[left], np.searchsorted(union[left], np.arange(len(unions) + 1))
+    return [after[start:stop] for start, stop in itertools.pairwise(borders.tolist())]
 
 
 def _moved_scale(sets: StateSet, theta: Floats, y: Floats, by: Displacement) -> Floats:
-    """The scales of sets whose pitch and altitude have moved into `theta` and `y`, (sets, 2) each, rounded outward."""
-    slow, fast = _turn(sets, _differences(sets.theta, theta, by.lower[0], by.upper[0]))
-    falls = _differences(sets.y, y, by.lower[2], by.upper[2])[:, None, :] / y[:, :, None]
+    """The scales of sets whose pitch and altitude have moved into `theta` and `y`, (sets, 2) each, rounded outward. `by`: (sets, 4)."""
+    slow, fast = _turn(sets, _differences(sets.theta, theta, by.lower[:, 0], by.upper[:, 0]))
+    falls = _differences(sets.y, y, by.lower[:, 2], by.upper[:, 2])[:, None, :] / y[:, :, None]
     shrinks, terms = 1 - falls, 1 + np.abs(falls)  # y/(y + epsilon) = 1 - epsilon/y'
     low = sets.scale[:, 0] * slow * np.maximum(lowered(shrinks, terms).min(axis=(1, 2)), 0)
     high = sets.scale[:, 1] * fast * raised(shrinks, terms).max(axis=(1, 2))
@@ -137,8 +166,8 @@ def _turn(sets: StateSet, delta: Floats) -> tuple[Floats, Floats]:
     return np.where(beyond, 0, slow), np.where(beyond, np.inf, fast)
 
 
-def _differences(before: Floats, after: Floats, low: float, high: float) -> Floats:
-    """How much a coordinate can have changed, (sets, 2), between `low` and `high`, from an interval into another, (sets, 2) each."""
+def _differences(before: Floats, after: Floats, low: Floats, high: Floats) -> Floats:
+    """How much a coordinate can have changed, (sets, 2), from an interval into another, (sets, 2) each, between `low` and `high`."""
     least, most = after[:, 0] - before[:, 1], after[:, 1] - before[:, 0]
     terms = np.abs(before).max(axis=1) + np.abs(after).max(axis=1)
     return np.stack([np.maximum(low, lowered(least, terms)), np.minimum(high, raised(most, terms))], axis=-1)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +20,10 @@ from numpy.typing import NDArray
 from runtime.assumptions import prior_assumption
 from runtime.estimate import Box, Estimate, Outcome
 from runtime.estimator import Estimator, Found
-from runtime.motion import STANDSTILL, Displacement, Motion, moved, moved_box
+from runtime.motion import STANDSTILL, Displacement, Motion, instant, moved_box, moved_each
 from runtime.refine.refiner import joined
 from runtime.refine.regions import regions_of
-from runtime.refine.slices import all_but, covering, slice_edges, sliced, within
+from runtime.refine.slices import all_but, covering, slice_edges, sliced, sliced_each, within
 from runtime.state_set import StateSet
 
 
@@ -65,8 +66,8 @@ class Tracker:
         """Forgets all frames; the next one is read by itself."""
         self._earlier: tuple[Seen, ...] = ()
         self._latest: tuple[Box, Displacement] | None = None
-        self._time_us: float | None = None
-        self._first_us: float | None = None
+        self._time_us: int | Fraction | None = None
+        self._first_us: int | Fraction | None = None
 
     def update(
         self,
@@ -77,34 +78,41 @@ class Tracker:
     ) -> Estimate:
         """State and certified box of the next frame, whose instant is `time_us`.
 
-        `prior`: a box that is known to hold the state now. `displacement`: bounds on how far the state has moved since the last frame that
-        was followed, by axis: {"theta": (low, high)}; axes that are not named follow the motion. Where frame, prior and the frames before
-        contradict each other, the outcome is INCONSISTENT, and the tracker goes on from this frame alone. A frame in which no state fits
-        by itself is not followed. A frame older than the last one is estimated by itself and counted in `late`. Raises `FrameError` as
-        `Estimator.estimate` does, and ValueError for a displacement of another axis, or of bounds that are not ordered.
+        `prior`: a box that is known to hold the state now. `displacement`: bounds on how far the state has moved since the last update
+        that was not late, by axis: {"theta": (low, high)}; axes that are not named follow the motion. Where frame, prior and the frames
+        before contradict each other, the outcome is INCONSISTENT, and the tracker goes on from this frame alone. Nothing rests on a frame
+        in which no state fits by itself; the displacement told with it counts. A frame older than the last one is estimated by itself and
+        counted in `late`: after a time that was wrong, and far ahead, every frame is, until `reset`. Raises `FrameError` as
+        `Estimator.estimate` does, and ValueError for a time that is not finite and for a displacement of another axis, or of bounds that
+        are not ordered; the tracker is then as it was before, and the displacement told next is since the update before.
         """
-        step = self._step(time_us, displacement)
+        now_us = instant(time_us)
+        step = self._step(now_us, displacement)
         if step is None:
             self.late += 1
             return self.estimator.estimate(frame, prior=prior)
         found = self.estimator.find(frame)
-        self._time_us = time_us
+        self._time_us = now_us
         self._earlier = tuple(seen.later(step) for seen in self._earlier)
         self._latest = None if self._latest is None else (self._latest[0], self._latest[1] + step)
         left, seen = self._left(found, prior)
         return self._followed(found, left, seen, prior) if len(left) else self._contradicted(found, prior)
 
     def box_at(self, time_us: float) -> Box | None:
-        """The box that the state lies in at another instant, by the last certified box and the motion; None where nothing is known."""
+        """The box that the state lies in at another instant, by the last certified box and the motion; None where nothing is known.
+
+        Raises ValueError for a time that is not finite.
+        """
+        other_us = instant(time_us)
         if self._latest is None or self._time_us is None:
             return None
         box, since = self._latest
-        lower, upper = moved_box(box.lower, box.upper, since + self.motion.over(time_us - self._time_us))
+        lower, upper = moved_box(box.lower, box.upper, since + self.motion.over(float(other_us - self._time_us)))
         return Box(lower, upper) if np.isfinite(lower).all() and np.isfinite(upper).all() else None
 
-    def _step(self, time_us: float, displacement: Mapping[str, tuple[float, float]] | None) -> Displacement | None:
+    def _step(self, now_us: int | Fraction, displacement: Mapping[str, tuple[float, float]] | None) -> Displacement | None:
         """How far the state can have moved since the last frame; None if this one is older."""
-        elapsed_us = 0 if self._time_us is None else time_us - self._time_us
+        elapsed_us = 0.0 if self._time_us is None else float(now_us - self._time_us)
         step = self.motion.over(max(elapsed_us, 0)).replaced(displacement or {})
         return step if elapsed_us >= 0 else None
 
@@ -132,7 +140,7 @@ class Tracker:
 
     def _held(self) -> list[StateSet]:
         """For q = 0 to `outliers`: the states of the domain that lie in what all but q of the earlier frames leave possible now."""
-        parts = [moved(self._camera, seen.sets, seen.since, self._domain) for seen in self._earlier]
+        parts = moved_each(self._camera, [seen.sets for seen in self._earlier], [seen.since for seen in self._earlier], self._domain)
         if len(parts) == 1 and self.outliers == 0:
             return parts
         whole = covering(self._camera, self._domain, self._camera.v0)
@@ -145,7 +153,7 @@ class Tracker:
             return [whole[:0]] * (self.outliers + 1)
         edges = slice_edges(theta)
         tangent = max((float(np.median(part.tangent)) for part in parts if len(part)), default=float(whole.tangent[0]))
-        start, *sources = (sliced(self._camera, sets, edges, tangent) for sets in (whole, *parts))
+        start, *sources = sliced_each(self._camera, [whole, *parts], edges, tangent)
         return [sets[~sets.empty] for sets in all_but(sources, start, self.outliers)]
 
     def _followed(self, found: Found, left: StateSet, seen: StateSet, prior: Box | None) -> Estimate:
@@ -169,7 +177,9 @@ class Tracker:
         self._time_us = time_us
         if len(alone) == 0:
             return self.estimator.concluded(found, (), assumed)
-        self._earlier, self._first_us = (self._passed_on(alone),), time_us
+        self._first_us = time_us
+        if self.horizon != 1:
+            self._earlier = (self._passed_on(alone),)
         if self.outliers == 0:
             self._latest = regions_of(alone, self._domain, [np.arange(len(alone))])[0], STANDSTILL
         return self.estimator.concluded(found, (), assumed, Outcome.INCONSISTENT)
@@ -186,6 +196,6 @@ class Tracker:
         frames = "every frame that was followed" if self.horizon is None else f"each of the last {self.horizon} frames"
         if self.outliers:
             frames = f"of the last {self.horizon} frames all but {self.outliers} at most"
-        since = "" if self._first_us is None else f" since {self._first_us:.16g} us"
+        since = "" if self._first_us is None else f" since {float(self._first_us):.16g} us"
         own = (f"Over time: this holds of {frames}{since}, and the state moves by {self.motion}, or as told.",)
         return (*self.estimator.assumed, *(() if prior is None else (prior_assumption(prior.lower, prior.upper),)), *own)

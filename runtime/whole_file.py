@@ -1,7 +1,8 @@
 """Files that are there whole or not at all: written beside their place, put onto the disk, then renamed.
 
 A file that was there before stays as it is until every new one is on the disk; of those that were begun and not finished nothing is
-left. Links stay, and the file that they lead to is replaced; a device or a pipe never is.
+left. A process that is killed outright leaves its own: whoever writes the same file later removes them. Links stay, and the file that they
+lead to is replaced; a device or a pipe never is.
 """
 
 from __future__ import annotations
@@ -9,8 +10,13 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import re
+import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+
+STALE_S = 3600
+"""Whoever still writes a file writes more often than this."""
 
 
 @contextlib.contextmanager
@@ -23,6 +29,7 @@ def replacing(path: Path) -> Iterator[Path]:
     part = _part_of(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        _remove_stale_parts(path)
         yield part
         _onto_disk(part)
         part.replace(path)
@@ -72,6 +79,7 @@ class OutputFolder:
             if path.exists() and given.exists() and path.samefile(given):
                 raise OutputError(f"{path}: is read and would be replaced; give another folder with -o")
         self._begun[name] = _part_of(path), path
+        _remove_stale_parts(path)
         return self._begun[name][0]
 
     def write(self, name: str, content: bytes) -> None:
@@ -120,6 +128,31 @@ def _replaceable(path: Path) -> Path:
 def _part_of(path: Path) -> Path:
     """Beside the file, with its suffix, by which OpenCV knows a format; of this process alone, as another may write there too."""
     return path.with_name(f"{path.stem}.{os.getpid()}.part{path.suffix}")
+
+
+def _remove_stale_parts(path: Path) -> None:
+    """Removes what processes that are no more have begun of this file, if for `STALE_S` nothing has been written to it.
+
+    Of a process in another container, or on another machine, it can't be seen whether it is still there.
+    """
+    if os.name != "posix":
+        return
+    pattern = re.compile(rf"{re.escape(path.stem)}\.(\d{{1,9}})\.part{re.escape(path.suffix)}")
+    with contextlib.suppress(OSError):
+        parts = [(each, match) for each in path.parent.iterdir() if (match := pattern.fullmatch(each.name))]
+        for part, match in parts:
+            if not _is_running(int(match[1])) and time.time() - part.stat().st_mtime > STALE_S:
+                part.unlink(missing_ok=True)
+
+
+def _is_running(process: int) -> bool:
+    try:
+        os.kill(process, 0)  # which sends nothing
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # somebody else's
+        return True
+    return True
 
 
 def _onto_disk(path: Path) -> None:

@@ -15,7 +15,7 @@ light, or that of a neighbour within the block's motion, is a threshold away fro
 are larger than the texture's grain, far above the runway, this may miss an event.
 
 Writes approach.raw (Prophesee EVT3), approach.npz, truth.csv: the state at the instant of every window, from the first event on; and
-attitude.csv: what an attitude reference would say, for `run-model --track --attitude`.
+attitude.csv and gyroscope.csv: what an attitude reference and a gyroscope would say, for `run-model --track`.
 At the defaults the windows are the paper's 1320 images at 25 per second. Exit code 2 if something given cannot be used.
 """
 
@@ -34,6 +34,7 @@ import numpy as np
 import typer
 from approach import approach_states
 from attitude_reference import AttitudeReference, attitude_text
+from gyroscope_reference import GyroscopeReference, gyroscope_text
 from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
@@ -401,6 +402,12 @@ def attitudes(flight: Flight, seed: int) -> Floats:
     return AttitudeReference().readings(lambda times: flight.states(times)[:, 0], flight.duration_us, flight.vibration.pitch_rad, rng)
 
 
+def body_rates(flight: Flight, seed: int, plus_minus_rad_s: float = GyroscopeReference.plus_minus_rad_s) -> Floats:
+    """What a gyroscope says of the flight; its errors are drawn apart, too."""
+    rng = np.random.default_rng([seed, 2])
+    return GyroscopeReference(plus_minus_rad_s).readings(lambda times: flight.states(times)[:, 0], flight.duration_us, rng)
+
+
 def write_raw(path: Path, events: NDArray[Any], shape: tuple[int, int]) -> None:
     """The events as Prophesee RAW, EVT3, whole or not at all."""
     import faery
@@ -416,7 +423,7 @@ def write_raw(path: Path, events: NDArray[Any], shape: tuple[int, int]) -> None:
 
 
 def simulate(camera: EventCamera, seed: int, out: Path, console: Console) -> None:
-    """Flies, writes the four files and prints what was recorded; `seed` is that of the attitude reference's errors."""
+    """Flies, writes the five files and prints what was recorded; `seed` is that of the errors of attitude reference and gyroscope."""
     count = -(-camera.flight.duration_us // BLOCK_US)
     packets = list(track(camera.blocks(), "flying", total=count, console=console, transient=True))
     events = np.concatenate(packets)
@@ -427,8 +434,9 @@ def simulate(camera: EventCamera, seed: int, out: Path, console: Console) -> Non
     write_whole(out / "approach.npz", columns.getvalue())
     write_whole(out / "truth.csv", truth_text(instants, states).encode())
     write_whole(out / "attitude.csv", attitude_text(attitudes(camera.flight, seed)).encode())
+    write_whole(out / "gyroscope.csv", gyroscope_text(body_rates(camera.flight, seed)).encode())
     console.print(_summary(events, len(instants), camera))
-    console.print(f"written: {out}/approach.raw, approach.npz, truth.csv and attitude.csv", markup=False)
+    console.print(f"written: {out}/approach.raw, approach.npz, truth.csv, attitude.csv and gyroscope.csv", markup=False)
 
 
 def _summary(events: NDArray[Any], windows: int, camera: EventCamera) -> Table:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 pytest.importorskip("cv2", reason="the extra 'recordings' is not installed")
 pytest.importorskip("typer", reason="the extra 'recordings' is not installed")
 
+import compare_tracking
 import cv2
 import replay
 import typer
@@ -30,6 +31,7 @@ from runtime.image import runway_image
 from runtime.recordings.attitude import COLUMNS as ATTITUDE_COLUMNS
 from runtime.recordings.attitude import AttitudeReadings
 from runtime.recordings.cli import run_model
+from runtime.recordings.gyroscope import COLUMNS as GYROSCOPE_COLUMNS
 from runtime.recordings.history import MOST_MOMENTS, History, Moment, draw_history
 from runtime.recordings.recording import EVENT
 from runtime.recordings.report import COLUMNS, TRACKED_COLUMNS, TRACKED_INSIDE, TRUTH_COLUMNS
@@ -573,9 +575,56 @@ def test_an_attitude_reference_makes_the_box_smaller_and_a_wrong_one_is_found(re
     assert "of any 5 windows all but 1 at most keep these assumptions" in " ".join(done.stdout.split())
 
 
+def gyroscope_file(path: Path, off: float) -> Path:
+    """Readings every 10 ms of the mean pitch rates from window to window, off by so much, with a plus-minus of 0.02 rad/s."""
+    times = np.arange(0, 1_000_001, 10_000)
+    turning = np.gradient(np.interp(times, 40_000 * np.arange(WINDOWS) + 20_000, STATES[:, 0]), times * 1e-6)
+    none = 0 * times
+    columns = [times, none, -turning + off, none, none, none + 0.02, none]
+    np.savetxt(path, np.column_stack(columns), delimiter=",", header=",".join(GYROSCOPE_COLUMNS), comments="")
+    return path
+
+
+def test_a_gyroscope_makes_the_box_smaller_and_a_wrong_one_is_found(recording, truth, tmp_path):
+    options = (MODEL, recording, "-o", tmp_path, "--truth", truth, "--no-video", "--track", "--motion", MOTION)
+    assert invoke(*options).exit_code == 0
+    without = widths(rows_of(tmp_path), "tracked_")
+    done = invoke(*options, "--gyroscope", gyroscope_file(tmp_path / "good.csv", 0.015))
+    assert (done.exit_code, done.stderr) == (0, "")
+    rows = rows_of(tmp_path)
+    assert [row["tracked_truth_inside"] for row in rows] == ["0" if number == 7 else "1" for number in range(WINDOWS)]
+    assert np.median(widths(rows, "tracked_")) < 0.9 * np.median(without)
+    assert "within the plus-minus of" in " ".join(done.stdout.split())
+    assert invoke(*options, "--gyroscope", gyroscope_file(tmp_path / "bad.csv", 3.0)).exit_code == 0
+    assert "inconsistent" in {row["tracked_outcome"] for row in rows_of(tmp_path)}
+
+
+def test_ways_to_follow_a_recording_are_compared(recording, truth, tmp_path):
+    files = ["--attitude", attitude_file(tmp_path / "a.csv", 0.004), "--gyroscope", gyroscope_file(tmp_path / "g.csv", 0.015)]
+    app = typer.Typer()
+    app.command()(compare_tracking.main)
+    done = CliRunner().invoke(app, [*map(str, [MODEL, recording, truth, *files]), "--motion", MOTION])
+    assert done.exit_code == 0, done.output
+    rows = [line.split("│") for line in done.stdout.splitlines() if line.startswith("│")]
+    assert [row[1].strip() for row in rows] == [
+        "the frame alone",
+        "over time",
+        "with the reference",
+        "with the gyroscope",
+        "with both",
+    ]
+    assert [[int(cell) for cell in row[2:6]] for row in rows] == [[WINDOWS - 1, 1, 0, 0]] * len(rows)
+    theta = [float(row[6].split()[0]) for row in rows]
+    assert theta[4] <= theta[2] < theta[1] < theta[0]
+    broken = CliRunner().invoke(app, [str(MODEL), str(recording), str(tmp_path / "none.csv")])
+    assert (broken.exit_code, broken.stderr.count("\n")) == (2, 1)
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        (["--gyroscope", "g.csv"], "--gyroscope: found g.csv without --track; add --track, or leave it out"),
+        (["--track", "--motion", MOTION, "--gyroscope", "none.csv"], "none.csv: [Errno 2] No such file or directory: 'none.csv'; give "),
         (["--track"], "--track: the model's scene has no [motion]; give --motion, the largest rates of theta, x, y, z"),
         (["--motion", MOTION], f"--motion: found {MOTION} without --track; add --track, or leave it out"),
         (["--track", "--motion", "1,2"], "--motion: found '1,2'; give four numbers from 0 on, as 0.1,0,0.3,1 (rad/s and m/s)"),

@@ -16,6 +16,7 @@ pytest.importorskip("typer", reason="the extra 'recordings' is not installed")
 import derive_field
 import simulate_approach as simulator
 from attitude_reference import attitude_text
+from gyroscope_reference import gyroscope_text
 from rich.console import Console
 from scenes import AIRPORT, PAPER
 from test_lens import WIDE
@@ -23,11 +24,13 @@ from test_sensor_map import seen_through
 
 from build_model.calibration import check_calibration
 from build_model.window import Window
+from runtime import Motion
 from runtime.camera import project, project_points
 from runtime.explanation import missed_pixels
 from runtime.frames import FrameStream
 from runtime.image import dilated, runway_image
 from runtime.recordings.attitude import AttitudeReadings
+from runtime.recordings.gyroscope import GyroscopeReadings
 from runtime.recordings.recording import read_events
 from runtime.scene import Axis, Calibration, Domain, Scene, Tolerance
 from runtime.sensor_map import SensorMap
@@ -180,7 +183,13 @@ def test_the_files_hold_the_same_events_and_the_truth_of_every_window(paper_scen
     assert rows[0] == ["time_us", "theta_rad", "x_m", "y_m", "z_m"]
     frames = list(FrameStream((480, 640), 40_000).frames([events]))
     assert [int(row[0]) for row in rows[1:]] == [start + 20_000 for start, _ in frames]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["approach.npz", "approach.raw", "attitude.csv", "truth.csv"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "approach.npz",
+        "approach.raw",
+        "attitude.csv",
+        "gyroscope.csv",
+        "truth.csv",
+    ]
 
 
 def test_a_part_beyond_the_approach_is_refused(paper_scene):
@@ -297,3 +306,24 @@ def test_a_lens_bends_what_the_sensor_sees() -> None:
     u, v = np.array([3.5]), np.array([7.5])
     assert simulator.pinhole_points(PAPER.camera, u, v) == (u, v)
     assert simulator.largest_stretch(PAPER.camera) == 1
+
+
+# --- the gyroscope ---
+
+
+def test_the_gyroscopes_plus_minus_holds_and_is_used(paper_scene, tmp_path):
+    """Turned between any two instants, as a tracker is told it; on a flight's first and last readings too."""
+    flight = simulator.Flight(paper_scene, 0.0, simulator.PAPER_SECONDS, simulator.Vibration(), np.random.default_rng(3))
+    motion, path, rng, shares = Motion([-1.0] * 4, [1.0] * 4), tmp_path / "gyroscope.csv", np.random.default_rng(4), []
+    for seed in range(12):
+        path.write_text(gyroscope_text(simulator.body_rates(flight, seed)))
+        readings = GyroscopeReadings.load(path)
+        since = np.concatenate([[0, 0, flight.duration_us - 40_000], rng.uniform(0, flight.duration_us - 40_000, 60)])
+        for start, stop in zip(since, since + rng.choice([40_000, 3_000], len(since)), strict=True):
+            first, last = flight.states(np.array([start, stop]))[:, 0]
+            low, high = readings.turned(start, stop, motion)
+            assert low <= last - first <= high
+            assert high - low < 2 * 0.015 * (stop - start) / 1e6
+            shares.append((last - first - low) / (high - low))
+    assert min(shares) < 0.25
+    assert max(shares) > 0.75

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from scenes import AIRPORT, FREE_X, PAPER, STRIP, Floats, state_sets, states_in
+from scenes import AIRPORT, FREE_X, PAPER, STRIP, Floats, examples, state_sets, states_in
 
 from runtime import Box
 from runtime.camera import ground_scale
+from runtime.motion import Displacement, moved, moved_each
 from runtime.refine.refiner import joined
-from runtime.refine.slices import SLICES, all_but, covering, rereferenced, slice_edges, sliced, within
+from runtime.refine.slices import SLICES, all_but, covering, rereferenced, slice_edges, sliced, sliced_each, within
 from runtime.scene import Scene
 from runtime.state_set import StateSet
 
@@ -64,6 +65,37 @@ def test_slices_of_one_set_keep_pitch_and_altitude_together(scene: Scene, data: 
     widest = (other.scale[:, 1] / other.scale[:, 0]).max()
     there = rereferenced(sets, np.full(1, tangent))
     assert widest <= there.scale[0, 1] / there.scale[0, 0] * (1 + 1e-9)
+
+
+@SCENES
+@examples(20)
+@given(data=st.data())
+def test_several_unions_are_cut_as_each_by_itself(scene: Scene, data: st.DataObject) -> None:
+    unions = [some_sets(scene, data, count)[0] for count in (2, 1, 3)]
+    unions.insert(1, unions[0][:0])
+    edges, tangent = slice_edges(joined(*unions).theta), float(unions[0].tangent[0])
+    for together, sets in zip(sliced_each(scene.camera, unions, edges, tangent), unions, strict=True):
+        assert_same(together, sliced(scene.camera, sets, edges, tangent))
+
+
+@SCENES
+@examples(20)
+@given(data=st.data())
+def test_several_unions_are_moved_as_each_by_itself(scene: Scene, data: st.DataObject) -> None:
+    unions = [some_sets(scene, data, count)[0] for count in (2, 1, 3)]
+    unions.insert(2, unions[0][:0])
+    size, rng = scene.domain.upper - scene.domain.lower, np.random.default_rng(data.draw(st.integers(0, 99)))
+    steps = [Displacement(*np.sort(rng.uniform(-0.5, 0.5, (2, 4)) * size, axis=0)) for _ in unions]
+    domain = Box(scene.domain.lower, scene.domain.upper)
+    for together, sets, step in zip(moved_each(scene.camera, unions, steps, domain), unions, steps, strict=True):
+        assert_same(together, moved(scene.camera, sets, step, domain))
+    assert moved_each(scene.camera, [], [], domain) == []
+
+
+def assert_same(first: StateSet, second: StateSet) -> None:
+    """To the last bit."""
+    for name in ("theta", "x", "y", "z", "scale", "tangent"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
 
 
 @SCENES

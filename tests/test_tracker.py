@@ -198,6 +198,51 @@ def test_instants_between_microseconds_are_not_rounded(paper: Estimator) -> None
     assert "since 1.5 us" in first.assumed[-1]
 
 
+@pytest.mark.parametrize("time_us", [np.nan, np.inf, -np.inf, np.float32(np.nan), 1e300, pytest.param(10**400, id="large")])
+def test_a_time_that_is_no_instant_is_refused(paper: Estimator, time_us: float) -> None:
+    """Taken for an instant, one such time would make every frame after it a late one."""
+    tracker = Tracker(paper, SLOW)
+    for _ in range(2):
+        with pytest.raises(ValueError, match=r"^time_us: found .*; give a finite number of microseconds$"):
+            tracker.update(image(MIDDLE), time_us)
+        with pytest.raises(ValueError, match=r"^time_us: found "):
+            tracker.box_at(time_us)
+        assert tracker.update(image(MIDDLE), 0).certified
+    assert tracker.late == 0
+
+
+@pytest.mark.parametrize("kind", [int, float, np.int64, np.uint64, np.int32, np.float64, np.longdouble], ids=lambda kind: kind.__name__)
+def test_times_of_any_number_are_told_apart(paper: Estimator, kind: Callable) -> None:
+    """numpy's integers would overflow: an unsigned time that is earlier would be far later."""
+    tracker = Tracker(paper, SLOW)
+    tracker.update(image(MIDDLE), kind(2 * 10**9))
+    assert tracker.update(image(ELSEWHERE), kind(2 * 10**9 - 5)).certified
+    assert tracker.late == 1
+    ahead, back = tracker.box_at(kind(2 * 10**9 + 10**5)), tracker.box_at(kind(2 * 10**9 - 10**5))
+    assert ahead is not None
+    assert back is not None
+    assert ahead.lower.tolist() == back.lower.tolist()
+
+
+def test_times_of_two_kinds_are_not_rounded(paper: Estimator) -> None:
+    """As a float64 the one is the other: a microsecond of motion would be lost."""
+    fast = Motion([-1e4, 0, 0, 0], [1e4, 0, 0, 0])
+    tracker = Tracker(paper, fast)
+    first = tracker.update(image(MIDDLE), 2**60 + 1)
+    box = tracker.box_at(float(2**60))
+    assert first.box is not None
+    assert box is not None
+    np.testing.assert_allclose(box.half_widths[0] - first.box.half_widths[0], 0.01, atol=1e-9)
+
+
+def test_no_time_is_too_short(paper: Estimator) -> None:
+    """Infinite rates over a time whose seconds are 0 in float64 are no NaN."""
+    tracker = Tracker(paper, Motion([-np.inf, 0, 1, 0], [np.inf, 0, 1, 0]))
+    assert tracker.update(image(MIDDLE), 0.0).certified
+    for number in range(1, 4):
+        assert tracker.update(image(MIDDLE), number * 5e-324).certified
+
+
 def test_unknown_rates_predict_nothing(paper: Estimator) -> None:
     tracker = Tracker(paper, Motion(np.full(4, -np.inf), np.full(4, np.inf)))
     assert tracker.update(image(MIDDLE), 0).certified
@@ -260,6 +305,16 @@ def test_a_horizon_forgets(paper: Estimator) -> None:
     assert tracker.update(image(ELSEWHERE), 1).certified
 
 
+def test_a_horizon_of_one_forgets_after_a_contradiction_too(paper: Estimator) -> None:
+    """A frame that a prior contradicts is not held against the next one, which the horizon says rests on itself alone."""
+    tracker = Tracker(paper, STILL, horizon=1)
+    assert tracker.update(image(ELSEWHERE), 0, prior=Box(MIDDLE, MIDDLE)).outcome is Outcome.INCONSISTENT
+    assert tracker.box_at(0) is not None
+    estimate = tracker.update(image(MIDDLE), 1)
+    assert estimate.box is not None
+    assert estimate.box.contains(MIDDLE)
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -287,6 +342,9 @@ def test_bad_arguments_leave_the_tracker_as_it_was(paper: Estimator) -> None:
     before = tracker.box_at(0)
     with pytest.raises(ValueError, match="no axis is called 'roll'"):
         tracker.update(image(MIDDLE), 10, displacement={"roll": (0, 0)})
+    for low, high in ((1, 0), (np.nan, 1), (np.inf, np.inf), (-np.inf, -np.inf)):
+        with pytest.raises(ValueError, match=r"^displacement: found .* for x; give two ordered numbers$"):
+            tracker.update(image(MIDDLE), 10, displacement={"x": (low, high)})
     with pytest.raises(FrameError):
         tracker.update(np.zeros((2, 2), dtype=bool), 10)
     after = tracker.box_at(0)

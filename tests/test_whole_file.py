@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -42,6 +44,34 @@ def test_a_block_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
 def test_a_block_that_writes_nothing_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError), replacing(tmp_path / "table.csv"):
         pass
+
+
+@pytest.mark.parametrize("write", ["alone", "in a folder"])
+def test_what_a_killed_process_has_left_is_removed_by_a_later_one(tmp_path: Path, write: str) -> None:
+    """Nothing else is: of a process that runs, of one that may run elsewhere, of another file, nor what only looks like it."""
+    gone = subprocess.Popen([sys.executable, "-c", ""])
+    gone.wait()
+    stale = tmp_path / f"ta.ble.{gone.pid}.part.csv"
+    names = [
+        f"ta.ble.{os.getppid()}.part.csv",
+        f"ta.ble.{gone.pid}.part.png",
+        f"other.{gone.pid}.part.csv",
+        "ta.ble.mine.part.csv",
+        "ta.ble.csv.part",
+    ]
+    kept = [tmp_path / name for name in names]
+    young = tmp_path / f"ta.ble.{gone.pid}1.part.csv"
+    for path in (stale, young, *kept):
+        path.write_text("begun")
+        os.utime(path, (0, 0))
+    os.utime(young)
+    if write == "alone":
+        write_whole(tmp_path / "ta.ble.csv", b"whole")
+    else:
+        folder = OutputFolder(tmp_path)
+        folder.write("ta.ble.csv", b"whole")
+        folder.replace()
+    assert sorted(tmp_path.iterdir()) == sorted([tmp_path / "ta.ble.csv", young, *kept])
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from runtime.estimate import Box
 from runtime.motion import Motion
-from runtime.recordings.timed_rows import timed_rows
+from runtime.recordings.timed_rows import rows_with_plus_minus
 from runtime.rounding import lowered, raised
 
 ANGLES = ("roll", "pitch", "yaw")
@@ -36,12 +36,9 @@ class AttitudeReadings:
     def load(cls, path: str | Path) -> AttitudeReadings:
         """Reads a CSV file with the columns of `COLUMNS`. Raises `AttitudeError`."""
         try:
-            rows = timed_rows(path, COLUMNS)
+            rows = rows_with_plus_minus(path, COLUMNS)
         except ValueError as error:
             raise AttitudeError(error) from error
-        if (rows[:, 4:] < 0).any():
-            found = f"{len(rows)} lines, times that do not ascend, numbers that are not finite, or a plus-minus below 0"
-            raise AttitudeError(f"{path}: found {found}; give finite numbers in order of time")
         return cls(rows[:, 0], rows[:, 1:4], rows[:, 4:])
 
     def prior(self, time_us: float, motion: Motion, domain: Box) -> Box:

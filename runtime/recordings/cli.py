@@ -43,6 +43,7 @@ try:
     )
     from runtime.recordings.draw import png
     from runtime.recordings.follower import Follower, TrackingError
+    from runtime.recordings.gyroscope import GyroscopeError
     from runtime.recordings.latency_chart import latency_chart
     from runtime.recordings.noted import lines_of, noted_of
     from runtime.recordings.recording import Notes, RecordingError, read_events
@@ -69,6 +70,7 @@ def run_model(
     track: Annotated[bool, typer.Option("--track", help="Certify over time too: each frame within what those before leave.")] = False,
     motion: Annotated[str | None, typer.Option(help="Largest rates of theta, x, y, z, as 0.1,0,0.3,1; by default the scene's.")] = None,
     attitude: Annotated[Path | None, typer.Option(help="CSV of an attitude reference, whose pitch --track takes for known.")] = None,
+    gyroscope: Annotated[Path | None, typer.Option(help="CSV of a gyroscope, by which --track bounds how far the pitch turns.")] = None,
     horizon: Annotated[int | None, typer.Option(help="With --track: a box rests on the last so many windows alone.")] = None,
     outliers: Annotated[int, typer.Option(help="With --horizon: windows of it that may break their assumptions.")] = 0,
 ) -> None:
@@ -86,17 +88,18 @@ def run_model(
         gap_us, notes = _microseconds(largest_gap_ms), Notes()
         stream = FrameStream(estimator.scene.camera.shape, _microseconds(window_ms), step_us, largest_gap_us=gap_us)
         known = None if truth is None else Truth.load(truth)
-        follower = Follower.of(estimator, attitude, motion, horizon, outliers) if track else None
-        _demand_track(track, {"--motion": motion, "--attitude": attitude, "--horizon": horizon, "--outliers": outliers or None})
+        follower = Follower.of(estimator, attitude, gyroscope, motion, horizon, outliers) if track else None
+        files = {"--attitude": attitude, "--gyroscope": gyroscope}
+        _demand_track(track, {"--motion": motion, **files, "--horizon": horizon, "--outliers": outliers or None})
         packets = _nonempty(recording, read_events(recording, estimator.scene.camera.shape, notes))
-        inputs = [path for path in (model, recording, truth, attitude) if path is not None]
+        inputs = [path for path in (model, recording, truth, attitude, gyroscope) if path is not None]
         with Report(folder, estimator, stream.window_us, stream.step_us, known, video=video, tracked=track, inputs=inputs) as report:
             fault, code = _estimated(console, stream, packets, report, refine, follower)
             noted = noted_of(stream, notes)
             source = {"model": str(model), "sha256": estimator.sha256, "recording": str(recording), "fault": fault}
             source |= {} if follower is None else {"tracking": follower.description}
             summary = report.close({**source, "window_us": stream.window_us, "step_us": stream.step_us, **noted})
-    except (ModelError, EventError, RecordingError, TruthError, AttitudeError, TrackingError, OutputError) as error:
+    except (ModelError, EventError, RecordingError, TruthError, AttitudeError, GyroscopeError, TrackingError, OutputError) as error:
         fail(error)
     except OSError as error:
         fail(f"{recording}: cannot be read ({error.strerror or error}); give the path of a recording that can")

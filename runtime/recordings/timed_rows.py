@@ -30,3 +30,12 @@ def timed_rows(path: str | Path, columns: Sequence[str]) -> NDArray[np.float64]:
         found = f"{len(rows)} lines, times that do not ascend, or numbers that are not finite"
         raise ValueError(f"{path}: found {found}; give finite numbers in order of time")
     return rows
+
+
+def rows_with_plus_minus(path: str | Path, columns: Sequence[str]) -> NDArray[np.float64]:
+    """`timed_rows` of three readings and their three plus-minus. Raises ValueError for a plus-minus below 0, too."""
+    rows = timed_rows(path, columns)
+    if (rows[:, 4:] < 0).any():
+        found = f"{len(rows)} lines, times that do not ascend, numbers that are not finite, or a plus-minus below 0"
+        raise ValueError(f"{path}: found {found}; give finite numbers in order of time")
+    return rows

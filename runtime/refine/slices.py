@@ -19,6 +19,7 @@ from runtime.estimate import Box
 from runtime.model.limits import BELOW_HORIZON_PX
 from runtime.refine.altitude import contract_by_altitude
 from runtime.refine.interval import intersected
+from runtime.refine.refiner import joined
 from runtime.rounding import lowered, raised
 from runtime.scene import Camera
 from runtime.state_set import StateSet, scale_ratio, tangent_of_row
@@ -34,15 +35,15 @@ INTERVALS = ("theta", "x", "y", "z", "scale")
 def covering(camera: Camera, box: Box, row: float) -> StateSet:
     """One set that holds all states of the box; the row its scale refers to is `row`, or lower where that is too near the horizon."""
     theta, x, y, z = (np.array([[low, high]]) for low, high in zip(box.lower, box.upper, strict=True))
-    tangent = tangents_below_horizon(camera, tangent_of_row(camera, np.array([row])), float(box.lower[0]))
+    tangent = tangents_below_horizon(camera, tangent_of_row(camera, np.array([row])), box.lower[:1])
     sets = StateSet(theta, x, y, z, np.array([[0.0, np.inf]]), tangent)
     return contract_by_altitude(camera, sets)
 
 
-def tangents_below_horizon(camera: Camera, tangent: Floats, theta_low: float) -> Floats:
-    """The tangents of rows, (n,), or of a lower one that is `BELOW_HORIZON_PX` below the horizon of every theta from `theta_low` on."""
-    cosine, sine = cosine_and_sine(np.array([[theta_low]]))
-    return np.maximum(tangent, BELOW_HORIZON_PX / camera.focal_v_px - sine[0, 0] / cosine[0, 0])
+def tangents_below_horizon(camera: Camera, tangent: Floats, theta_low: Floats) -> Floats:
+    """The tangents of rows, (n,), or of lower ones, `BELOW_HORIZON_PX` below the horizon of every theta from `theta_low`, (n,), on."""
+    cosine, sine = cosine_and_sine(theta_low)
+    return np.maximum(tangent, BELOW_HORIZON_PX / camera.focal_v_px - sine / cosine)
 
 
 def rereferenced(sets: StateSet, tangent: Floats) -> StateSet:
@@ -83,15 +84,22 @@ def sliced(camera: Camera, sets: StateSet, edges: Floats, tangent: float) -> Sta
     All scales refer to one row: that of `tangent`, or a lower one where the states need it (`tangents_below_horizon`). Slices are closed;
     what lies outside of the edges is left out.
     """
+    return sliced_each(camera, [sets], edges, tangent)[0]
+
+
+def sliced_each(camera: Camera, unions: Sequence[StateSet], edges: Floats, tangent: float) -> list[StateSet]:
+    """`sliced` of several unions, at hardly more than the cost of one."""
+    sets, union = joined(*unions), np.arange(len(unions)).repeat([len(each) for each in unions])
     count = len(edges) - 1
-    tangents = tangents_below_horizon(camera, np.full(count, tangent), float(edges[0]))
+    tangents = tangents_below_horizon(camera, np.full(count, tangent), edges[:1])
     meets = (sets.theta[:, :1] <= edges[1:]) & (edges[:-1] <= sets.theta[:, 1:])
     which, place = np.nonzero(meets)
     parts = sets[which]
     sides = np.stack([edges[place], edges[place + 1]], axis=-1)
     parts = replace(parts, theta=_common(parts.theta, sides))
     parts = contract_by_altitude(camera, rereferenced(parts, tangents[place]))
-    return _hulls(parts, place, count, tangents)
+    slices = _hulls(parts, union[which] * count + place, count * len(unions), np.tile(tangents, len(unions)))
+    return [slices[number * count : (number + 1) * count] for number in range(len(unions))]
 
 
 def all_but(sources: Sequence[StateSet], start: StateSet, outliers: int) -> list[StateSet]:

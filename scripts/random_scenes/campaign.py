@@ -83,7 +83,7 @@ def seed_of_stopped(journal: Path, version: str, scenes: int) -> int | None:
 
 def limit_memory() -> None:
     """Makes an allocation fail before the machine runs out of memory."""
-    resource.setrlimit(resource.RLIMIT_DATA, (MOST_MEMORY_BYTES, resource.RLIM_INFINITY))
+    resource.setrlimit(resource.RLIMIT_DATA, (MOST_MEMORY_BYTES, resource.getrlimit(resource.RLIMIT_DATA)[1]))
 
 
 def outcomes_of(trials: list[Trial], jobs: int) -> Iterator[tuple[Trial, Outcomes]]:
