@@ -21,6 +21,16 @@ def assumptions(scene: Scene) -> list[str]:
     return lines
 
 
+def attitude_assumptions(scene: Scene, attitude: str, runs: int) -> list[str]:
+    """What takes the place of the first two assumptions where the camera has a roll and a yaw; `attitude` in words."""
+    tolerance = scene.tolerance
+    near = f" and {tolerance.line_px} px" if tolerance.line_px else ""
+    return [
+        "The state lies in the scene's domain with the pitch that the ideal frame shows, atan(tan(theta)/cos(yaw)), in the place of theta.",
+        f"The camera has a {attitude}, and is as in the scene, up to its [calibration]{near}; NN_F saw {runs} painted frames.",
+    ]
+
+
 def bounds_text(lower: Iterable[float], upper: Iterable[float]) -> str:
     """An interval a state axis, with units; an axis that is a number as one."""
     axes = zip(STATE_NAMES, STATE_UNITS, lower, upper, strict=True)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from runtime.assumptions import assumptions, prior_assumption
+from runtime.attitude import Attitude
 from runtime.estimate import Box, Estimate, FrameError, Outcome
 from runtime.model.entries import Entries
 from runtime.model.format import BOX_TENSORS, MASK_TENSORS, OUTPUTS, ModelError
@@ -34,6 +35,7 @@ from runtime.refine.theorem_b import refined_by_cell
 from runtime.refine.witnesses import witnesses
 from runtime.scene import STATE_NAMES, Scene, SceneError
 from runtime.state_set import StateSet
+from runtime.turned import TurnedStart, hull_of, seen_box, started
 
 REFINED_BEYOND_PX = 2
 """How far beyond the spatial masks the refinement looks at pixels; those farther out it takes for lit."""
@@ -52,6 +54,8 @@ class Found:
     cell_upper: NDArray[np.float32]
     filtered: NDArray[np.uint8]
     network_state: NDArray[np.float64]
+    turned: TurnedStart | None = None
+    """Where the camera is rolled or yawed: its attitude, and what of the bank passes (`runtime.turned`)."""
 
 
 class Estimator:
@@ -127,52 +131,91 @@ class Estimator:
         """The model's own outputs for one frame (table in models/README.md). Raises `FrameError` as `estimate` does."""
         return self.run_unchecked(self._checked_frame(frame))
 
-    def run_unchecked(self, pixels: NDArray[np.uint8]) -> dict[str, Any]:
-        """`run` for a frame that is known to be uint8 (height, width) of {0, 1}: one call of onnxruntime.
+    def run_unchecked(self, pixels: NDArray[np.uint8], budgets: Mapping[str, NDArray[np.int32]] | None = None) -> dict[str, Any]:
+        """`run` for a frame that is known to be uint8 (height, width) of {0, 1}: one call of onnxruntime. `budgets`: others than its own.
 
         Raises `ModelError` if that fails, which it may for a file that no `sha256` vouches for.
         """
         try:
-            return dict(zip(OUTPUTS, self._session.run(OUTPUTS, {"frame": pixels, **self._budgets}), strict=True))
+            return dict(zip(OUTPUTS, self._session.run(OUTPUTS, {"frame": pixels, **self._budgets, **(budgets or {})}), strict=True))
         except Exception as error:  # onnxruntime raises classes of its own that share only this one
             raise ModelError(f"{self._name}: onnxruntime cannot run it ({reason_of(error)}); export it again") from error
 
-    def estimate(self, frame: NDArray, proposal: ArrayLike | None = None, refine: bool = True, prior: Box | None = None) -> Estimate:
+    def estimate(
+        self,
+        frame: NDArray,
+        proposal: ArrayLike | None = None,
+        refine: bool = True,
+        prior: Box | None = None,
+        attitude: Attitude | None = None,
+    ) -> Estimate:
         """State and certified box of one frame.
 
         `frame`: (height, width), bool, or uint8 of {0, 1}. `proposal`: a state (4,) from elsewhere to be checked in place of NN_e's.
         `refine`: contract the passing entries to what the frame can tell (`runtime.refine`); without it, the box is their hull. `prior`: a
         box that is known to hold the state (Theorem C); if it contradicts a frame which has a state without it, the outcome is
-        INCONSISTENT. Raises `FrameError` for any other frame and ValueError for a proposal of another shape.
+        INCONSISTENT. `attitude`: roll and yaw of the camera, by default none; the frame is its sensor's own (`runtime.turned`), and
+        Theorem A alone is used. Raises `FrameError` for any other frame and ValueError for a proposal of another shape.
         """
         state = None if proposal is None else self._checked_proposal(proposal)
-        found = self.find(frame)
+        found = self.find(frame, attitude, prior)
         if prior is None:
-            return self.concluded(found, self._regions(found, refine), self.assumed, proposal=state)
-        left = self.left_of(found, self.covering(prior), refine)
+            return self._alone(found, refine, state)
+        left = self.left_of(found, self.covering(prior, attitude), refine)
         parts = None if refine else [np.arange(len(left))]
-        regions = regions_of(left, self.domain, parts) if len(left) else ()
-        otherwise = Outcome.INCONSISTENT if not regions and self._regions(found, refine) else Outcome.NO_RUNWAY
-        return self.concluded(found, regions, (*self.assumed, prior_assumption(prior.lower, prior.upper)), otherwise, state)
+        regions = self.regions(found, left, parts) if len(left) else ()
+        otherwise = Outcome.NO_RUNWAY
+        if not regions and self._alone(found if attitude is None else self.find(frame, attitude), refine).certified:
+            otherwise = Outcome.INCONSISTENT
+        assumed = (*self.assumed_of(found), prior_assumption(prior.lower, prior.upper))
+        return self.concluded(found, regions, assumed, otherwise, state, left)
 
-    def find(self, frame: NDArray) -> Found:
-        """What the model says of a frame. Raises `FrameError` as `estimate` does."""
-        pixels = self._checked_frame(frame)
-        cell, support, mismatch, passes, lower, upper, filtered, network_state = self.run_unchecked(pixels).values()
+    def find(self, frame: NDArray, attitude: Attitude | None = None, prior: Box | None = None) -> Found:
+        """What the model says of a frame; of one of a rolled or yawed camera, at the pitches that a prior allows.
+
+        Raises `FrameError` as `estimate` does, and ValueError for an attitude in a scene with a plus-minus of its calibration.
+        """
+        pixels, turned = self._checked_frame(frame), None
+        if attitude is None:
+            outputs = self.run_unchecked(pixels)
+        else:
+            if not self.scene.calibration.exact:
+                raise ValueError(
+                    "attitude: found a scene with a [calibration] plus-minus; give that of roll and yaw with the attitude instead"
+                )
+            lit = witnesses(pixels.view(np.bool_), self.scene.tolerance.line_px)
+            outputs, turned = started(self.scene, self._entries, self._run_by_theorem_a, lit, attitude, self._seen(prior, attitude))
+        cell, support, mismatch, passes, lower, upper, filtered, network_state = outputs.values()
         network = np.where(self._fixed, self.domain.lower, network_state)
-        return Found(pixels, int(cell), support, mismatch, passes, lower, upper, filtered, network)
+        return Found(pixels, int(cell), support, mismatch, passes, lower, upper, filtered, network, turned)
 
-    def covering(self, prior: Box) -> StateSet:
+    def _run_by_theorem_a(self, pixels: NDArray[np.uint8], met_by_one: int) -> dict[str, Any]:
+        """`run_unchecked` of a painted frame, in which a missed pixel may spoil several; without Theorem B, which nobody vouches for."""
+        budgets = {"missed_budget": self.missed_budget * met_by_one, "extra_budget": -1}
+        return self.run_unchecked(pixels, {name: np.array(budget, dtype=np.int32) for name, budget in budgets.items()})
+
+    def _seen(self, box: Box | None, attitude: Attitude | None) -> Box | None:
+        """The part of a box, of the camera's pitch, that lies in the domain, of the ideal frame's; None where there is none."""
+        if box is None:
+            return self.domain
+        if attitude is not None:
+            box = seen_box(box, attitude)
+        low, high = np.maximum(box.lower, self.domain.lower), np.minimum(box.upper, self.domain.upper)
+        return None if (low > high).any() else Box(low, high)
+
+    def covering(self, prior: Box, attitude: Attitude | None = None) -> StateSet:
         """The part of a box that lies in the domain, as a set of states; no set where there is none."""
-        low, high = np.maximum(prior.lower, self.domain.lower), np.minimum(prior.upper, self.domain.upper)
-        if (low > high).any():
-            return self._entries.all[:0]
-        return covering(self.scene.camera, Box(low, high), self.scene.camera.v0)
+        box = self._seen(prior, attitude)
+        return self._entries.all[:0] if box is None else covering(self.scene.camera, box, self.scene.camera.v0)
 
     def left_of(self, found: Found, known: StateSet | None = None, refine: bool = True) -> StateSet:
-        """Sets that hold every state which is consistent with the frame and, by Theorem C, lies in one of the `known` sets."""
+        """Sets that hold every state which is consistent with the frame and, by Theorem C, lies in one of the `known` sets.
 
+        Of a rolled or yawed camera, their theta is the pitch that the ideal frame shows, and so is that of the `known` ones.
+        """
         cut = None if known is None else partial(within, self.scene.camera, known=known)
+        if found.turned is not None:
+            return found.turned.left(self._refiner, found.pixels.view(np.bool_), cut, refine)
         frame, line_px = found.pixels.view(np.bool_), self.scene.tolerance.line_px
         if refine and self._refiner.extra_budget >= 0 and line_px == 0:  # Theorem B's claims are made at tolerance 0 only
             return refined_by_cell(self._refiner, self._entries, found.passes, frame, cut)
@@ -189,8 +232,12 @@ class Estimator:
         assumed: tuple[str, ...],
         otherwise: Outcome = Outcome.NO_RUNWAY,
         proposal: NDArray[np.float64] | None = None,
+        left: StateSet | None = None,
     ) -> Estimate:
-        """The estimate whose box is the hull of `regions`; its outcome is `otherwise` where there are none."""
+        """The estimate whose box is the hull of `regions`; its outcome is `otherwise` where there are none.
+
+        `left`: the sets that they are around, which a rolled or yawed camera's faces of the domain are seen by.
+        """
         box = Box.around(regions)
         state, used_fallback = self._shielded(box, found.network_state if proposal is None else proposal)
         return Estimate(
@@ -204,17 +251,28 @@ class Estimator:
             mismatch=int(found.mismatch[found.cell]),
             filtered=found.filtered,
             regions=regions,
-            touches_boundary=box is not None and self._touches_boundary(box),
+            touches_boundary=box is not None and self._touches_boundary(box if found.turned is None or left is None else hull_of(left)),
             assumed=assumed,
         )
 
-    def _regions(self, found: Found, refine: bool) -> tuple[Box, ...]:
-        """What is consistent with the frame alone, as boxes."""
-        passing = np.flatnonzero(found.support)
-        if refine and len(passing):
-            return regions_of(self.left_of(found), self.domain)
-        cells = [np.arange(len(passing))] if len(passing) else []
-        return hulls(found.cell_lower[passing], found.cell_upper[passing], cells, self.domain)
+    def assumed_of(self, found: Found) -> tuple[str, ...]:
+        """What a certificate by this frame rests on, in words."""
+        return self.assumed if found.turned is None else found.turned.assumed(self.scene, self.assumed)
+
+    def regions(self, found: Found, left: StateSet, parts: Sequence[NDArray[np.int64]] | None = None) -> tuple[Box, ...]:
+        """Boxes around parts of what is left, by default the connected ones; of a rolled or yawed camera, by its own pitch."""
+        return regions_of(left, self.domain, parts) if found.turned is None else found.turned.regions(left, self.domain, parts)
+
+    def _alone(self, found: Found, refine: bool, proposal: NDArray[np.float64] | None = None) -> Estimate:
+        """The estimate by the frame alone."""
+        passing, left = np.flatnonzero(found.support), None
+        if found.turned is not None or (refine and len(passing)):
+            left = self.left_of(found, refine=refine)
+            regions = self.regions(found, left, None if refine else [np.arange(len(left))]) if len(left) else ()
+        else:
+            cells = [np.arange(len(passing))] if len(passing) else []
+            regions = hulls(found.cell_lower[passing], found.cell_upper[passing], cells, self.domain)
+        return self.concluded(found, regions, self.assumed_of(found), proposal=proposal, left=left)
 
     def entries_within(self, frame: NDArray, missed_budget: int) -> StateSet:
         """The bank's entries of whose pixels K at most so many are dark: at another budget than the model's, no certificate of anything.

@@ -13,8 +13,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from runtime.attitude import camera_pitch, lead, seen_pitch
 from runtime.estimate import Box, axis_number
 from runtime.refine.altitude import contract_by_altitude
 from runtime.refine.slices import rereferenced, tangents_below_horizon
@@ -26,13 +27,15 @@ from runtime.turn import cosine_and_sine
 Floats = NDArray[np.float64]
 
 US_PER_S = 1e6
+STEEPEST_RAD = 1.57
+"""Pitches of a domain lie within right angles; one that may have moved beyond is no state of it."""
 FLAT = 1e-9
 """A slope in delta of no more than so much of its terms counts as both up and down: far above float64's error, and sound either way."""
 
 
 @dataclass(frozen=True)
 class Displacement:
-    """Bounds on how far a state has moved, (4,) each; infinite where nothing is known."""
+    """Bounds on how far a state has moved, (4,) each, or (sets, 4) where they differ from set to set; infinite where nothing is known."""
 
     lower: Floats
     upper: Floats
@@ -99,6 +102,7 @@ def moved(camera: Camera, sets: StateSet, by: Displacement, domain: Box) -> Stat
     low, high = np.maximum(low, domain.lower), np.minimum(high, domain.upper)
     inside = np.all(low <= high, axis=1)
     sets, low, high = sets[inside], low[inside], high[inside]
+    by = by if by.lower.ndim == 1 else Displacement(by.lower[inside], by.upper[inside])
     if len(sets) == 0:
         return sets
     lowest = min(float(sets.theta[:, 0].min()), float(low[:, 0].min()))
@@ -109,10 +113,28 @@ def moved(camera: Camera, sets: StateSet, by: Displacement, domain: Box) -> Stat
     return after[~after.empty]
 
 
+def with_pitches(sets: StateSet, by: Displacement, yaw_before: tuple[float, float], yaw_after: tuple[float, float]) -> Displacement:
+    """The displacement of sets whose theta is the pitch that the ideal frame shows, at one yaw before and another one after, (sets, 4).
+
+    `by` is that of the camera's own pitch, from which the other differs by `runtime.attitude.lead`.
+    """
+    before, after = (np.tile(yaw, (len(sets), 1)) for yaw in (yaw_before, yaw_after))
+    pitch = camera_pitch(sets.theta, before)
+    ahead = lead(sets.theta, pitch, before)
+    low, high = pitch[:, 0] + by.lower[0], pitch[:, 1] + by.upper[0]
+    pitch = np.clip(np.stack([lowered(low, np.abs(low)), raised(high, np.abs(high))], axis=-1), -STEEPEST_RAD, STEEPEST_RAD)
+    behind = lead(seen_pitch(pitch, after), pitch, after)
+    lower, upper = (np.tile(side, (len(sets), 1)) for side in (by.lower, by.upper))
+    terms = np.abs(ahead).max(axis=1) + np.abs(behind).max(axis=1)
+    lower[:, 0] += lowered(behind[:, 0] - ahead[:, 1], terms)
+    upper[:, 0] += raised(behind[:, 1] - ahead[:, 0], terms)
+    return Displacement(lowered(lower, np.abs(lower)), raised(upper, np.abs(upper)))
+
+
 def _moved_scale(sets: StateSet, theta: Floats, y: Floats, by: Displacement) -> Floats:
     """The scales of sets whose pitch and altitude have moved into `theta` and `y`, (sets, 2) each, rounded outward."""
-    slow, fast = _turn(sets, _differences(sets.theta, theta, by.lower[0], by.upper[0]))
-    falls = _differences(sets.y, y, by.lower[2], by.upper[2])[:, None, :] / y[:, :, None]
+    slow, fast = _turn(sets, _differences(sets.theta, theta, by.lower[..., 0], by.upper[..., 0]))
+    falls = _differences(sets.y, y, by.lower[..., 2], by.upper[..., 2])[:, None, :] / y[:, :, None]
     shrinks, terms = 1 - falls, 1 + np.abs(falls)  # y/(y + epsilon) = 1 - epsilon/y'
     low = sets.scale[:, 0] * slow * np.maximum(lowered(shrinks, terms).min(axis=(1, 2)), 0)
     high = sets.scale[:, 1] * fast * raised(shrinks, terms).max(axis=(1, 2))
@@ -137,7 +159,7 @@ def _turn(sets: StateSet, delta: Floats) -> tuple[Floats, Floats]:
     return np.where(beyond, 0, slow), np.where(beyond, np.inf, fast)
 
 
-def _differences(before: Floats, after: Floats, low: float, high: float) -> Floats:
+def _differences(before: Floats, after: Floats, low: ArrayLike, high: ArrayLike) -> Floats:
     """How much a coordinate can have changed, (sets, 2), between `low` and `high`, from an interval into another, (sets, 2) each."""
     least, most = after[:, 0] - before[:, 1], after[:, 1] - before[:, 0]
     terms = np.abs(before).max(axis=1) + np.abs(after).max(axis=1)

@@ -173,8 +173,8 @@ class Camera:
 
     @property
     def pinhole(self) -> bool:
-        """True if the frame is the ideal one: no distortion, and no turn in the aircraft."""
-        return (self.distortion is None or self.distortion.none) and (self.mount is None or self.mount == Mount())
+        """True if the frame of a level camera is the ideal one: no distortion."""
+        return self.distortion is None or self.distortion.none
 
     @property
     def u0(self) -> float:
@@ -374,10 +374,15 @@ class MotionBounds:
     x_m_s: tuple[float, float]
     y_m_s: tuple[float, float]
     z_m_s: tuple[float, float]
+    roll_rad_s: tuple[float, float] | None = None
+    yaw_rad_s: tuple[float, float] | None = None
+    """Of the aircraft, for attitudes between two readings."""
 
     def __post_init__(self) -> None:
-        for field, (low, high) in zip(dataclasses.fields(self), self.rates, strict=True):
-            _demand(low <= high, f"motion.{field.name}", [low, high], "give the least and the largest rate, in that order")
+        for field in dataclasses.fields(self):
+            rates = getattr(self, field.name)
+            if rates is not None:
+                _demand(rates[0] <= rates[1], f"motion.{field.name}", list(rates), "give the least and the largest rate, in that order")
 
     @property
     def rates(self) -> tuple[tuple[float, float], ...]:
@@ -442,10 +447,8 @@ class Scene:
         self._check_margin(nearest, farthest)
 
     def _check_lens(self) -> None:
-        advice = "only 0 is taken so far"
-        _demand(self.camera.mount in (None, Mount()), "camera.mount", "a camera that is turned in the aircraft", advice)
         none = self.camera.distortion is None or self.camera.distortion.none
-        _demand(none, "camera.distortion", "a lens that is no pinhole", advice)
+        _demand(none, "camera.distortion", "a lens that is no pinhole", "only 0 is taken so far")
 
     def _check_margin(self, nearest: float, farthest: float) -> None:
         """The margin of `runtime.rounding` is twice float64's error on rows and columns in view, or more. Raises `SceneError`.

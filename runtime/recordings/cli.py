@@ -68,7 +68,10 @@ def run_model(
     refine: Annotated[bool, typer.Option("--refine/--no-refine", help="Contract the passing entries: tighter and slower.")] = True,
     track: Annotated[bool, typer.Option("--track", help="Certify over time too: each frame within what those before leave.")] = False,
     motion: Annotated[str | None, typer.Option(help="Largest rates of theta, x, y, z, as 0.1,0,0.3,1; by default the scene's.")] = None,
-    attitude: Annotated[Path | None, typer.Option(help="CSV of an attitude reference, whose pitch --track takes for known.")] = None,
+    attitude: Annotated[Path | None, typer.Option(help="CSV of an attitude reference: the aircraft's roll, pitch and yaw.")] = None,
+    pitch_alone: Annotated[
+        bool, typer.Option("--pitch-alone", help="Of --attitude: take roll and yaw for 0, as the scene has it.")
+    ] = False,
     horizon: Annotated[int | None, typer.Option(help="With --track: a box rests on the last so many windows alone.")] = None,
     outliers: Annotated[int, typer.Option(help="With --horizon: windows of it that may break their assumptions.")] = 0,
 ) -> None:
@@ -86,8 +89,9 @@ def run_model(
         gap_us, notes = _microseconds(largest_gap_ms), Notes()
         stream = FrameStream(estimator.scene.camera.shape, _microseconds(window_ms), step_us, largest_gap_us=gap_us)
         known = None if truth is None else Truth.load(truth)
-        follower = Follower.of(estimator, attitude, motion, horizon, outliers) if track else None
-        _demand_track(track, {"--motion": motion, "--attitude": attitude, "--horizon": horizon, "--outliers": outliers or None})
+        follower = Follower.of(estimator, attitude, motion, horizon, outliers, pitch_alone) if track else None
+        options = {"--motion": motion, "--attitude": attitude, "--horizon": horizon, "--outliers": outliers or None}
+        _demand_track(track, {**options, "--pitch-alone": pitch_alone or None})
         packets = _nonempty(recording, read_events(recording, estimator.scene.camera.shape, notes))
         inputs = [path for path in (model, recording, truth, attitude) if path is not None]
         with Report(folder, estimator, stream.window_us, stream.step_us, known, video=video, tracked=track, inputs=inputs) as report:
@@ -168,8 +172,9 @@ def _estimate_all(
     task = None if bar is None else bar.add_task("windows", total=None, seconds=0.0)
     seconds = 0.0
     for start_us, frame in stream.frames(packets):
+        attitude = None if follower is None else follower.known(start_us + report.instant_us)[0]
         begun = time.perf_counter()
-        estimate = report.estimator.estimate(frame, refine=refine)
+        estimate = report.estimator.estimate(frame, refine=refine, attitude=attitude)
         milliseconds = 1000 * (time.perf_counter() - begun)
         tracked = None if follower is None else follower.update(frame, start_us + report.instant_us)
         report.add(start_us, frame, estimate, milliseconds, tracked)
