@@ -10,7 +10,7 @@ from flint import arb, arb_mat, ctx
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from turned_cases import TurnedState
+from turned_state import TurnedState
 
 from runtime import Attitude
 from runtime.attitude import LARGEST_ANGLE_RAD, Angle, Turns, camera_pitch, lead, mounted, seen_pitch

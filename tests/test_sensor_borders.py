@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scenes import examples
 from test_contractors import CONTRACTORS, WHOLE, Case, cases, clutter_of, spoiled, whole_markings
-from turned_cases import TurnedState
+from turned_state import TurnedState
 
 from runtime.refine.lit_pixels import LitPixels
 from runtime.refine.sensor_borders import SensorBorders

@@ -11,7 +11,7 @@ import pytest
 from compare_limit import constant_network
 from rational_image import RationalState, RationalView
 from scenes import AIRPORT, CUT_LEFT, FREE_X, PAPER, STRIP
-from turned_cases import TurnedState
+from turned_state import TurnedState
 
 from build_model.export import export_model
 from runtime import Attitude, Box, Estimator, Motion, Outcome, Scene, Tracker
