@@ -37,10 +37,12 @@ from build_model.paper.paper_bound import PaperBound, paper_bound
 from build_model.partition import partition
 from build_model.state_network import TrainingReport, state_graph, train_state_network
 from build_model.user_network import bare, user_network
+from build_model.window import Bits
 from runtime.assumptions import assumptions
 from runtime.model.format import FORMAT_VERSION, IR_VERSION, METADATA_KEY, NETWORK_OUTPUT, NETWORK_PREFIX, OPSET, metadata_digest
 from runtime.rounding import OUTWARD_PX
 from runtime.scene import Scene
+from runtime.sensor import Sensor
 from runtime.whole_file import write_whole
 
 Progress = Callable[[str, int, int, float | None], None]
@@ -107,17 +109,19 @@ def export_model(
     `ClusterError` for a cluster that cannot be used, OSError if the file cannot be written.
     """
     watch = _Stopwatch()
+    sensor = Sensor.of(scene)
+    ideal = sensor.ideal
     with watch.stage("NN_F"):
-        banks = build_banks(scene, jobs, progress, dask)
-        tables = assemble(scene, banks)
-        shift_px = check_calibration(scene, tables.window)
-        filter_part = filter_graph(scene, tables)
+        banks = build_banks(ideal, jobs, progress, dask, sensor.unseen)
+        tables = assemble(ideal, banks)
+        shift_px = check_calibration(ideal, tables.window)
+        filter_part = filter_graph(ideal, tables)
     with watch.stage("NN_e"):
-        network, report = _state_network(scene, filter_part, estimator, seed, progress)
+        network, report = _state_network(ideal, filter_part, estimator, seed, progress)
     with watch.stage("file"):
         graph = _joined(filter_part, network)
-        bounds = paper_bounds(scene, jobs, dask)
-        content = _serialised(graph, _metadata(scene, tables, graph, shift_px, bounds, report, seed))
+        bounds = paper_bounds(ideal, jobs, dask)
+        content = _serialised(graph, _metadata(sensor, tables, graph, shift_px, bounds, report, seed))
         write_whole(Path(path), content)
     return ExportReport(
         cells=len(banks),
@@ -133,14 +137,17 @@ def export_model(
     )
 
 
-def build_banks(scene: Scene, jobs: int = 1, progress: Progress = _silent, dask: str | None = None) -> list[CellBank]:
+def build_banks(
+    scene: Scene, jobs: int = 1, progress: Progress = _silent, dask: str | None = None, unseen: Bits | None = None
+) -> list[CellBank]:
     """S, entries, O and K of every cell, in the order of the partition.
 
-    Cells are independent: `jobs` local processes build them, or the workers of the dask.distributed scheduler at the address `dask`,
-    who must have the same version of this package; cells of a worker that is lost are built by another one. Raises `ClusterError`.
+    Pixels that are `unseen`, (height, width), and so lit in any frame, are in no K. Cells are independent: `jobs` local processes build
+    them, or the workers of the dask.distributed scheduler at the address `dask`, who must have the same version of this package; cells of a
+    worker that is lost are built by another one. Raises `ClusterError`.
     """
     cells = partition(scene)
-    work = (joblib.delayed(cell_bank)(scene, lower, upper) for lower, upper in zip(cells.lower, cells.upper, strict=True))
+    work = (joblib.delayed(cell_bank)(scene, lower, upper, unseen) for lower, upper in zip(cells.lower, cells.upper, strict=True))
     banks = []
     with _workers(jobs, dask):
         for bank in joblib.Parallel(return_as="generator")(work):
@@ -227,7 +234,7 @@ def _joined(filter_part: onnx.GraphProto, network: onnx.GraphProto) -> onnx.Grap
 
 
 def _metadata(
-    scene: Scene,
+    sensor: Sensor,
     tables: FilterTables,
     graph: onnx.GraphProto,
     shift_px: float,
@@ -235,7 +242,11 @@ def _metadata(
     report: TrainingReport | None,
     seed: int,
 ) -> dict[str, Any]:
+    scene, through = sensor.scene, {}
+    if sensor.map is not None:
+        through = {"ideal_camera": sensor.ideal.to_dict()["camera"], "ideal_pixels_a_pixel": sensor.pixels_a_pixel}
     return {
+        **through,
         "format_version": FORMAT_VERSION,
         "scene": scene.to_dict(),
         "graph_sha256": hashlib.sha256(graph.SerializeToString(deterministic=True)).hexdigest(),

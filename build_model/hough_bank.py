@@ -131,20 +131,20 @@ class _Entries:
         return bool((self.may_light.sum(axis=(1, 2)) <= missed_budget).any())
 
 
-def cell_bank(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> CellBank:
-    """S, entries, O and K of the cell [lower, upper], both (4,).
+def cell_bank(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64], unseen: Bits | None = None) -> CellBank:
+    """S, entries, O and K of the cell [lower, upper], both (4,). Of K are left out the pixels, (height, width), that are lit in any frame.
 
     Boxes without a state of the cell are dropped, if proved so. An entry with |K| <= missed_budget would pass on any frame: it is halved
     until its parts are stronger. Raises `SceneError` where `HALVINGS` do not get there.
     """
     spatial, window = spatial_filter(scene, lower, upper)
-    parts = [_entries(scene, line_boxes(scene, lower, upper), lower, upper, spatial, window)]
+    parts = [_entries(scene, line_boxes(scene, lower, upper), lower, upper, spatial, window, unseen)]
     for halving in range(HALVINGS):
         weak = parts[-1].weak(scene.tolerance.missed_budget)
         if not 0 < weak.sum() <= MOST_WEAK or parts[-1].hopeless(scene.tolerance.missed_budget):
             break
         halves = _halved(parts[-1].lines[weak], HALVING_ORDER[halving % len(HALVING_ORDER)])
-        parts[-1:] = [parts[-1][~weak], _entries(scene, halves, lower, upper, spatial, window)]
+        parts[-1:] = [parts[-1][~weak], _entries(scene, halves, lower, upper, spatial, window, unseen)]
     _demand_strong(scene, parts[-1])
     state_lower, state_upper = (np.concatenate([getattr(part.states, side) for part in parts]) for side in ("lower", "upper"))
     return CellBank(
@@ -159,7 +159,13 @@ def cell_bank(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float6
 
 
 def _entries(
-    scene: Scene, lines: LineBoxes, lower: NDArray[np.float64], upper: NDArray[np.float64], spatial: Bits, window: Window
+    scene: Scene,
+    lines: LineBoxes,
+    lower: NDArray[np.float64],
+    upper: NDArray[np.float64],
+    spatial: Bits,
+    window: Window,
+    unseen: Bits | None,
 ) -> _Entries:
     """The masks of the boxes that are not proved empty."""
     states = contract(scene.camera, lines.states(scene.camera, lower, upper))
@@ -168,6 +174,8 @@ def _entries(
     line_px = scene.tolerance.line_px
     may_light = paint(widened(scene, columns_that_may_be_lit(scene, states, line_px), line_px), window) & spatial
     must_light = paint(inset(scene, columns_that_must_be_lit(scene, states), line_px), window)
+    if unseen is not None:
+        must_light &= ~unseen[window.slices]
     return _Entries(lines, states, must_light, may_light)
 
 

@@ -258,7 +258,8 @@ def _size(tables: dict[str, Any]) -> tuple[int, int] | None:
 def _pair(key: str, value: Any) -> tuple[int, int]:
     """Width and height, from a list or a table."""
     sides = [value.get("width"), value.get("height")] if isinstance(value, dict) else value
-    _demand(isinstance(sides, list) and len(sides) == 2, key, value, "give the width and the height")
+    if not isinstance(sides, list) or len(sides) != 2:
+        raise CalibrationFileError(f"{key}: found {value!s:.120}; give the width and the height")
     width, height = (_number(key, side) for side in sides)
     _demand(width == int(width) and height == int(height), key, value, "give whole numbers of pixels")
     return int(width), int(height)
@@ -267,7 +268,8 @@ def _pair(key: str, value: Any) -> tuple[int, int]:
 def _numbers(key: str, value: Any, count: int | None = None) -> list[float]:
     """The numbers of a matrix: OpenCV's and ROS's table with `data`, or a list, of rows too."""
     values = value.get("data") if isinstance(value, dict) else value
-    _demand(isinstance(values, list | str), key, "nothing" if values is None else values, "give a row of numbers")
+    if not isinstance(values, list | str):
+        raise CalibrationFileError(f"{key}: found {'nothing' if values is None else values!s:.120}; give a row of numbers")
     flat = [number for item in ([values] if isinstance(values, str) else values) for number in (item if isinstance(item, list) else [item])]
     _demand(count is None or len(flat) == count, key, f"{len(flat)} numbers", f"give {count}")
     return [_number(key, number) for number in flat]

@@ -34,6 +34,7 @@ from runtime.refine.slices import covering, within
 from runtime.refine.theorem_b import refined_by_cell
 from runtime.refine.witnesses import witnesses
 from runtime.scene import STATE_NAMES, Scene, SceneError
+from runtime.sensor import Sensor
 from runtime.state_set import StateSet
 from runtime.turned import TurnedStart, hull_of, seen_box, started
 
@@ -43,9 +44,10 @@ REFINED_BEYOND_PX = 2
 
 @dataclass(frozen=True)
 class Found:
-    """What the model says of one frame: its outputs (models/README.md), and the frame itself."""
+    """What the model says of one frame: its outputs (models/README.md), `filtered` in the sensor's frame."""
 
     pixels: NDArray[np.uint8]
+    """The ideal frame: the sensor's own, or what was painted of it."""
     cell: int
     support: NDArray[np.int32]
     mismatch: NDArray[np.int32]
@@ -68,17 +70,18 @@ class Estimator:
             self.scene = Scene.from_dict(model.metadata.get("scene", {}))
         except SceneError as error:
             raise ModelError(f"{name}: the scene in its metadata is unusable ({error})") from error
+        self.sensor = _sensor_of(self.scene, model.metadata, name)
         self._budgets = self._checked_budgets(name, missed_budget, extra_budget)
-        self._entries = Entries.of(self.scene, model.tensors, name)
+        self._entries = Entries.of(self.ideal, model.tensors, name)
         if self.metadata["smallest_must_light"] != model.tensors["must_light_size"].min():
             raise ModelError(f"{name}: its metadata misstate the smallest |K| of its entries; export it again with export-model")
         self._session = open_session(model.content, name, threads)
-        check_interface(self._session, self.scene, model.tensors["must_light_size"].shape, name)
+        check_interface(self._session, self.ideal, model.tensors["must_light_size"].shape, name)
         self.domain = Box(self.scene.domain.lower, self.scene.domain.upper)
         self._fixed = self.domain.lower == self.domain.upper
         window = self._entries.window_and_beyond(REFINED_BEYOND_PX)
-        self._refiner = Refiner(self.scene, int(self._budgets["missed_budget"]), int(self._budgets["extra_budget"]), window)
-        budgets = {name: int(budget) for name, budget in self._budgets.items()}
+        self._refiner = Refiner(self.ideal, int(self._budgets["missed_budget"]), int(self._budgets["extra_budget"]), window)
+        budgets = {"missed_budget": self.missed_budget, "extra_budget": self.extra_budget}
         self.assumed = tuple(assumptions(replace(self.scene, tolerance=replace(self.scene.tolerance, **budgets))))
         # The file's absolute path: whoever reads it again may do so after a change of folder.
         budgets = {"missed_budget": missed_budget, "extra_budget": extra_budget}
@@ -90,9 +93,14 @@ class Estimator:
         return partial(Estimator.load, threads=self._threads, **self._arguments), ()
 
     @property
+    def ideal(self) -> Scene:
+        """The scene that NN_F is built for: `scene` itself, or behind a lens what its ideal frame shows."""
+        return self.sensor.ideal
+
+    @property
     def missed_budget(self) -> int:
         """m of Theorem A: pixels of the runway's image that may be dark."""
-        return int(self._budgets["missed_budget"])
+        return int(self._budgets["missed_budget"]) // self.sensor.pixels_a_pixel
 
     @property
     def extra_budget(self) -> int:
@@ -102,7 +110,7 @@ class Estimator:
     @property
     def largest_missed_budget(self) -> int:
         """The largest that `load` takes: one below the smallest |K| of the model's entries."""
-        return self.metadata["smallest_must_light"] - 1
+        return (self.metadata["smallest_must_light"] - 1) // self.sensor.pixels_a_pixel
 
     @classmethod
     def load(
@@ -129,10 +137,10 @@ class Estimator:
 
     def run(self, frame: NDArray) -> dict[str, Any]:
         """The model's own outputs for one frame (table in models/README.md). Raises `FrameError` as `estimate` does."""
-        return self.run_unchecked(self._checked_frame(frame))
+        return self.run_unchecked(self.ideal_frame(frame))
 
     def run_unchecked(self, pixels: NDArray[np.uint8], budgets: Mapping[str, NDArray[np.int32]] | None = None) -> dict[str, Any]:
-        """`run` for a frame that is known to be uint8 (height, width) of {0, 1}: one call of onnxruntime. `budgets`: others than its own.
+        """`run` for an ideal frame that is known to be uint8 (height, width) of {0, 1}: one call of onnxruntime. `budgets`: other ones.
 
         Raises `ModelError` if that fails, which it may for a file that no `sha256` vouches for.
         """
@@ -173,20 +181,24 @@ class Estimator:
     def find(self, frame: NDArray, attitude: Attitude | None = None, prior: Box | None = None) -> Found:
         """What the model says of a frame; of one of a rolled or yawed camera, at the pitches that a prior allows.
 
-        Raises `FrameError` as `estimate` does, and ValueError for an attitude in a scene with a plus-minus of its calibration.
+        Raises `FrameError` as `estimate` does, and ValueError for an attitude with a plus-minus in [calibration], or with a
+        budget of missed pixels behind a lens.
         """
-        pixels, turned = self._checked_frame(frame), None
+        own, turned = self._checked_frame(frame), None
         if attitude is None:
+            pixels = self.sensor.painted(own)
             outputs = self.run_unchecked(pixels)
         else:
             if not self.scene.calibration.exact:
-                raise ValueError(
-                    "attitude: found a scene with a [calibration] plus-minus; give that of roll and yaw with the attitude instead"
-                )
-            lit = witnesses(pixels.view(np.bool_), self.scene.tolerance.line_px)
-            outputs, turned = started(self.scene, self._entries, self._run_by_theorem_a, lit, attitude, self._seen(prior, attitude))
+                raise ValueError("attitude: found a scene with a plus-minus in [calibration]; give that of roll and yaw with the attitude")
+            if self.sensor.map is not None and self.missed_budget > 0:
+                raise ValueError(f"attitude: found missed_budget {self.missed_budget} behind a lens; load the model with 0")
+            pixels, seen = own, self._seen(prior, attitude)
+            outputs, turned = started(self.sensor, self._entries, self._run_by_theorem_a, own, attitude, seen)
         cell, support, mismatch, passes, lower, upper, filtered, network_state = outputs.values()
         network = np.where(self._fixed, self.domain.lower, network_state)
+        if pixels is not own:
+            filtered = own & self.sensor.seen_in(filtered.view(np.bool_))
         return Found(pixels, int(cell), support, mismatch, passes, lower, upper, filtered, network, turned)
 
     def _run_by_theorem_a(self, pixels: NDArray[np.uint8], met_by_one: int) -> dict[str, Any]:
@@ -206,17 +218,17 @@ class Estimator:
     def covering(self, prior: Box, attitude: Attitude | None = None) -> StateSet:
         """The part of a box that lies in the domain, as a set of states; no set where there is none."""
         box = self._seen(prior, attitude)
-        return self._entries.all[:0] if box is None else covering(self.scene.camera, box, self.scene.camera.v0)
+        return self._entries.all[:0] if box is None else covering(self.ideal.camera, box, self.ideal.camera.v0)
 
     def left_of(self, found: Found, known: StateSet | None = None, refine: bool = True) -> StateSet:
         """Sets that hold every state which is consistent with the frame and, by Theorem C, lies in one of the `known` sets.
 
         Of a rolled or yawed camera, their theta is the pitch that the ideal frame shows, and so is that of the `known` ones.
         """
-        cut = None if known is None else partial(within, self.scene.camera, known=known)
+        cut = None if known is None else partial(within, self.ideal.camera, known=known)
         if found.turned is not None:
-            return found.turned.left(self._refiner, found.pixels.view(np.bool_), cut, refine)
-        frame, line_px = found.pixels.view(np.bool_), self.scene.tolerance.line_px
+            return found.turned.left(self._refiner, cut, refine)
+        frame, line_px = found.pixels.view(np.bool_), self.ideal.tolerance.line_px
         if refine and self._refiner.extra_budget >= 0 and line_px == 0:  # Theorem B's claims are made at tolerance 0 only
             return refined_by_cell(self._refiner, self._entries, found.passes, frame, cut)
         entries = self._entries.sets(found.passes)
@@ -257,7 +269,7 @@ class Estimator:
 
     def assumed_of(self, found: Found) -> tuple[str, ...]:
         """What a certificate by this frame rests on, in words."""
-        return self.assumed if found.turned is None else found.turned.assumed(self.scene, self.assumed)
+        return self.assumed if found.turned is None else found.turned.assumed(self.assumed)
 
     def regions(self, found: Found, left: StateSet, parts: Sequence[NDArray[np.int64]] | None = None) -> tuple[Box, ...]:
         """Boxes around parts of what is left, by default the connected ones; of a rolled or yawed camera, by its own pitch."""
@@ -274,13 +286,17 @@ class Estimator:
             regions = hulls(found.cell_lower[passing], found.cell_upper[passing], cells, self.domain)
         return self.concluded(found, regions, self.assumed_of(found), proposal=proposal, left=left)
 
+    def ideal_frame(self, frame: NDArray) -> NDArray[np.uint8]:
+        """What NN_F sees of a frame: the frame, or behind a lens what is painted of it. Raises `FrameError` as `estimate` does."""
+        return self.sensor.painted(self._checked_frame(frame))
+
     def entries_within(self, frame: NDArray, missed_budget: int) -> StateSet:
-        """The bank's entries of whose pixels K at most so many are dark: at another budget than the model's, no certificate of anything.
+        """The bank's entries of whose pixels K, of the ideal frame, at most so many are dark: at another budget no certificate of anything.
 
         Raises `FrameError` as `estimate` does.
         """
         budgets = {"missed_budget": np.array(missed_budget, dtype=np.int32), "extra_budget": np.array(-1, dtype=np.int32)}
-        (passes,) = self._session.run(["passes"], {"frame": self._checked_frame(frame), **budgets})
+        (passes,) = self._session.run(["passes"], {"frame": self.ideal_frame(frame), **budgets})
         return self._entries.sets(np.asarray(passes))
 
     def estimate_many(self, frames: Iterable[NDArray], refine: bool = True, processes: int = 2) -> Iterator[Estimate]:
@@ -300,7 +316,7 @@ class Estimator:
 
     def spatial_mask(self, cell: int) -> NDArray[np.bool_]:
         """S of a cell, (height, width): every pixel that one of its states can light, widened by the tolerance."""
-        return self._entries.within(cell, np.ones(self.scene.camera.shape, dtype=np.bool_))
+        return self.sensor.seen_in(self._entries.within(cell, np.ones(self.ideal.camera.shape, dtype=np.bool_)))
 
     @staticmethod
     def _shielded(box: Box | None, proposal: NDArray[np.float64]) -> tuple[NDArray[np.float64] | None, bool]:
@@ -339,11 +355,28 @@ class Estimator:
         tolerance = self.scene.tolerance
         missed = tolerance.missed_budget if missed is None else missed
         extra = tolerance.extra_budget if extra is None else extra
-        if not 0 <= missed < weakest:
-            raise ModelError(f"{name}: missed_budget {missed}: must be 0 to {weakest - 1}, below the smallest |K| of its entries")
+        count = self.sensor.pixels_a_pixel
+        if not 0 <= count * missed < weakest:
+            largest = (weakest - 1) // count
+            raise ModelError(f"{name}: missed_budget {missed}: must be 0 to {largest}, below the smallest |K| of its entries")
+        if self.sensor.map is not None and extra != -1:
+            raise ModelError(f"{name}: extra_budget {extra}: behind a lens only Theorem A holds; give -1")
         if not -1 <= extra < 2**31:
             raise ModelError(f"{name}: extra_budget {extra}: must be 0 or more, or -1 for not used")
-        return {"missed_budget": np.array(missed, dtype=np.int32), "extra_budget": np.array(extra, dtype=np.int32)}
+        return {"missed_budget": np.array(count * missed, dtype=np.int32), "extra_budget": np.array(extra, dtype=np.int32)}
+
+
+def _sensor_of(scene: Scene, metadata: dict[str, Any], name: str) -> Sensor:
+    """What stands between a model's frames and its ideal ones. Raises `ModelError` if that is not what its metadata say."""
+    try:
+        sensor = Sensor.of(scene)
+    except SceneError as error:
+        raise ModelError(f"{name}: the scene in its metadata is unusable ({error})") from error
+    stated = metadata.get("ideal_camera"), metadata.get("ideal_pixels_a_pixel")
+    expected = (None, None) if sensor.map is None else (sensor.ideal.to_dict()["camera"], sensor.pixels_a_pixel)
+    if stated != expected:
+        raise ModelError(f"{name}: its ideal frame is not the one that its camera has; export it again with export-model")
+    return sensor
 
 
 def _loaded(arguments: dict[str, Any]) -> Callable[[NDArray[np.uint8]], Estimate]:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from runtime.camera import project
 from runtime.estimate import Estimate
 from runtime.estimator import Estimator
-from runtime.image import columns_of_ends, dilated, image_of_ends, runway_image
+from runtime.image import columns_of_ends, dilated, marking_images, runway_image
 from runtime.scene import STATE_NAMES, STATE_UNITS, Scene
 from runtime.state_set import StateSet, fall
 
@@ -93,8 +93,7 @@ def missed_pixels(scene: Scene, frame: NDArray, state: Floats, line_px: int) -> 
 
 def dark_pixels(scene: Scene, frame: NDArray, state: Floats) -> NDArray[np.bool_]:
     """The pixels of each marking's image that have no lit pixel of the frame within `line_px`, (markings, height, width)."""
-    images = image_of_ends(project(scene, state)[:, None], scene.camera.shape) != 0
-    return images & ~dilated(frame != 0, scene.tolerance.line_px)
+    return marking_images(scene, state) & ~dilated(frame != 0, scene.tolerance.line_px)
 
 
 def explain(estimator: Estimator, frame: NDArray, estimate: Estimate) -> Explanation:
@@ -109,8 +108,8 @@ def explain(estimator: Estimator, frame: NDArray, estimate: Estimate) -> Explana
 
 def _nearest_state(estimator: Estimator, frame: NDArray) -> Floats:
     """The state (4,) with the fewest dark pixels that a search meets: from draws out of the likeliest entries ever closer to the best."""
-    scene, rng = estimator.scene, np.random.default_rng(0)
-    sums = _dark_sums(scene, frame)
+    scene, rng = estimator.ideal, np.random.default_rng(0)
+    sums = _dark_sums(scene, estimator.ideal_frame(frame))
     entries = _likeliest_entries(estimator, frame)
     sides = np.stack([entries.theta, entries.x, entries.scale, entries.z], axis=1)
     low, width = sides[..., 0], np.maximum(sides[..., 1] - sides[..., 0], 0)

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from runtime.camera import project
 from runtime.scene import Scene
+from runtime.sensor_image import sensor_images
 
 Integers = NDArray[np.int64]
 
@@ -59,8 +60,20 @@ def lit_columns(scene: Scene, states: ArrayLike) -> tuple[Integers, Integers]:
 
 
 def runway_image(scene: Scene, states: ArrayLike) -> NDArray[np.uint8]:
-    """I_r of every state, uint8 of {0, 1}. `states`: (..., 4); returns (..., height, width)."""
-    return image_of_ends(project(scene, states), scene.camera.shape)
+    """I_r of every state in the sensor's frame, uint8 of {0, 1}. `states`: (..., 4); returns (..., height, width).
+
+    Exact for a pinhole; behind a lens outward by up to a 16th of a pixel (`runtime.sensor_image`).
+    """
+    if scene.camera.pinhole:
+        return image_of_ends(project(scene, states), scene.camera.shape)
+    return np.maximum.reduce(sensor_images(scene, states), axis=-3)
+
+
+def marking_images(scene: Scene, state: ArrayLike) -> NDArray[np.bool_]:
+    """What each marking lights of `runway_image`. `state`: (4,); returns (markings, height, width)."""
+    if scene.camera.pinhole:
+        return image_of_ends(project(scene, state)[:, None], scene.camera.shape) != 0
+    return sensor_images(scene, state) != 0
 
 
 def dilated(frame: NDArray[np.bool_], radius_px: int) -> NDArray[np.bool_]:

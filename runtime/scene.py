@@ -443,12 +443,7 @@ class Scene:
         widest = math.pi / 2 - SMALLEST_ANGLE_AHEAD_RAD
         ahead = -widest <= flattest and steepest <= widest
         _demand(ahead, "domain", "a state with the runway behind the camera (Z <= 0)", "narrow theta_rad, y_m or z_m")
-        self._check_lens()
         self._check_margin(nearest, farthest)
-
-    def _check_lens(self) -> None:
-        none = self.camera.distortion is None or self.camera.distortion.none
-        _demand(none, "camera.distortion", "a lens that is no pinhole", "only 0 is taken so far")
 
     def _check_margin(self, nearest: float, farthest: float) -> None:
         """The margin of `runtime.rounding` is twice float64's error on rows and columns in view, or more. Raises `SceneError`.

@@ -60,7 +60,7 @@ class Tracker:
         if outliers < 0 or (outliers > 0 and (horizon is None or outliers >= horizon)):
             raise ValueError(f"outliers: found {outliers} with a horizon of {horizon}; give 0, or fewer than the frames of a horizon")
         self.estimator, self.motion, self.horizon, self.outliers = estimator, bounds, horizon, outliers
-        self._camera, self._domain = estimator.scene.camera, estimator.domain
+        self._camera, self._domain = estimator.ideal.camera, estimator.domain
         self.late = 0
         """Frames that came after a later one, and so were not followed."""
         self.reset()

@@ -21,7 +21,7 @@ from runtime.assumptions import attitude_assumptions
 from runtime.attitude import Attitude, Turns, camera_pitch, seen_pitch
 from runtime.estimate import Box
 from runtime.model.entries import Entries
-from runtime.plain_painting import met_by_one, painted
+from runtime.painting import painted
 from runtime.refine.lit_pixels import LitPixels
 from runtime.refine.refiner import Refiner, joined
 from runtime.refine.regions import regions_of
@@ -29,9 +29,12 @@ from runtime.refine.sensor_borders import SensorBorders
 from runtime.refine.slices import INTERVALS, rereferenced
 from runtime.refine.witnesses import witnesses
 from runtime.scene import Camera, Scene
+from runtime.sensor import Sensor
+from runtime.sensor_map import SensorMap, Turn
 from runtime.state_set import StateSet
 
 Floats = NDArray[np.float64]
+Bits = NDArray[np.bool_]
 
 BLUR_PX = 2.0
 """Bins of pitch, yaw and roll are so narrow that none moves a point of the ideal frame by much more than this."""
@@ -93,20 +96,27 @@ def _cut(interval: Floats, count: int) -> Floats:
 class TurnedStart:
     """What a frame of a rolled or yawed camera leaves of the bank."""
 
+    sensor: Sensor
     attitude: Attitude
-    entries: StateSet
-    """The entries that pass in each bin, with its roll and yaw, or hulls of them where they are many."""
-    runs: int
-    """How often NN_F was run."""
+    lit: Bits
+    """The sensor's frame, (height, width), dilated by the tolerance: what lies beyond it is lit."""
+    parts: tuple[tuple[NDArray[np.uint8], StateSet], ...]
+    """For every bin its painted frame, and the entries that pass there, with its roll and yaw."""
 
-    def left(self, refiner: Refiner, frame: NDArray[np.bool_], cut: Callable[[StateSet], StateSet] | None, refine: bool) -> StateSet:
-        """What of the entries is consistent with the sensor's frame, (height, width), and what is known besides, to which `cut` cuts."""
-        sets = self.entries if cut is None else cut(self.entries)
-        if not refine or len(sets) == 0:
-            return sets
-        scene = refiner.scene
-        sensor = replace(refiner, extra_budget=-1, window=window_of(scene, sets))
-        return sensor.refine(witnesses(frame, scene.tolerance.line_px), sets, narrowed=cut is not None)
+    def left(self, refiner: Refiner, cut: Callable[[StateSet], StateSet] | None, refine: bool) -> StateSet:
+        """What of the entries is consistent with the frame, and with what is known besides, to which `cut` cuts.
+
+        Behind a lens, each bin's entries are refined on its painted frame; else all of them on the sensor's own pixels.
+        """
+        parts = [(frame, sets if cut is None else cut(sets)) for frame, sets in self.parts]
+        together = joined(*(sets for _, sets in parts))
+        if not refine or len(together) == 0:
+            return together
+        if self.sensor.map is not None:
+            return joined(*(_refined_painted(refiner, frame, sets, cut is not None) for frame, sets in parts if len(sets)))
+        together, scene = grouped(together, MOST_ENTRIES), refiner.scene
+        sensor = replace(refiner, extra_budget=-1, window=window_of(scene, together))
+        return sensor.refine(self.lit, together, narrowed=cut is not None)
 
     def regions(self, left: StateSet, domain: Box, parts: Sequence[NDArray[np.int64]] | None) -> tuple[Box, ...]:
         """Boxes around parts of what is left, by the camera's pitch; `domain` is of the pitch that the ideal frame shows."""
@@ -121,35 +131,57 @@ class TurnedStart:
         """Sets that are known from elsewhere, with the attitude's roll and yaw."""
         return _with(sets, self.attitude)
 
-    def assumed(self, scene: Scene, otherwise: tuple[str, ...]) -> tuple[str, ...]:
+    def assumed(self, otherwise: tuple[str, ...]) -> tuple[str, ...]:
         """What a certificate rests on: the model's assumptions, that of the attitude in the place of none."""
-        return (*attitude_assumptions(scene, str(self.attitude), self.runs), *otherwise[2:])
+        return (*attitude_assumptions(self.sensor.scene, str(self.attitude), len(self.parts)), *otherwise[2:])
+
+
+def _refined_painted(refiner: Refiner, frame: NDArray[np.uint8], sets: StateSet, narrowed: bool) -> StateSet:
+    """What of the entries of a bin is consistent with its painted frame, with the bin's roll and yaw."""
+    level = replace(sets, roll=None, yaw=None)
+    left = replace(refiner, extra_budget=-1).refine(frame.view(np.bool_), level, narrowed=narrowed)
+    assert sets.roll is not None
+    assert sets.yaw is not None
+    return replace(left, roll=np.repeat(sets.roll[:1], len(left), axis=0), yaw=np.repeat(sets.yaw[:1], len(left), axis=0))
 
 
 def started(
-    scene: Scene,
+    sensor: Sensor,
     entries: Entries,
     run: Callable[[NDArray[np.uint8], int], dict[str, Any]],
-    lit: NDArray[np.bool_],
+    pixels: NDArray[np.uint8],
     attitude: Attitude,
     seen: Box | None,
 ) -> tuple[dict[str, Any], TurnedStart]:
     """NN_F's outputs on the painted frames of all bins, taken together, and what of the bank passes.
 
-    `run`: NN_F on a frame, with the budget of missed pixels times a number. `lit`: the sensor's frame, dilated by the tolerance. `seen`: a
-    box that holds the state, with the pitch that the ideal frame shows; None if there is none.
+    `run`: NN_F on a frame, with the budget of missed pixels times a number. `pixels`: the sensor's frame. `seen`: a box that holds the
+    state, with the pitch that the ideal frame shows; None if there is none.
     """
+    scene = sensor.ideal
+    lit = witnesses(pixels.view(np.bool_), sensor.scene.tolerance.line_px)
     if seen is None:
-        outputs = run(np.zeros(lit.shape, dtype=np.uint8), 1)
-        return outputs, TurnedStart(attitude, _with(entries.all[:0], attitude), 1)
+        outputs = run(np.zeros(scene.camera.shape, dtype=np.uint8), 1)
+        return outputs, TurnedStart(sensor, attitude, lit, ((pixels, _with(entries.all[:0], attitude)),))
     together: dict[str, Any] = {}
     parts = []
-    for each in (bins := list(bins_of(scene.camera, attitude, (float(seen.lower[0]), float(seen.upper[0]))))):
+    for each in bins_of(scene.camera, attitude, (float(seen.lower[0]), float(seen.upper[0]))):
         turns = each.turns
-        outputs = run(painted(scene.camera, lit, turns), met_by_one(scene, turns))
-        parts.append(each.of(entries.sets(outputs["passes"])))
+        frame = painted(lit, turned_map(sensor, turns))
+        outputs = run(frame, met_by_one(scene, turns))
+        parts.append((frame, each.of(entries.sets(outputs["passes"]))))
         together = _together(together, outputs)
-    return together, TurnedStart(attitude, grouped(joined(*parts), MOST_ENTRIES), len(bins))
+    return together, TurnedStart(sensor, attitude, lit, tuple(parts))
+
+
+def turned_map(sensor: Sensor, turns: Turns) -> SensorMap:
+    """The map of a sensor for the rotations of one set."""
+    a, b = ((float(cosine[0]), float(sine[0]), float(off[0])) for cosine, sine, off in _sides(turns))
+    return replace(sensor.still, turn=Turn(a, b))
+
+
+def _sides(turns: Turns) -> tuple[tuple[Floats, Floats, Floats], ...]:
+    return (turns.cos_a, turns.sin_a, turns.off_a), (turns.cos_b, turns.sin_b, turns.off_b)
 
 
 def _with(sets: StateSet, attitude: Attitude) -> StateSet:
@@ -203,6 +235,30 @@ def hulls_of(sets: StateSet, place: NDArray[np.int64]) -> StateSet:
         np.maximum.at(high, place, side[:, 1])
         hulls[name] = np.stack([low, high], axis=-1)
     return StateSet(**hulls, tangent=tangent)
+
+
+def met_by_one(scene: Scene, turns: Turns) -> int:
+    """Most pixels of the ideal frame that all markings together can meet inside what one pixel of the sensor shows.
+
+    With S' = cos(a) S + sin(a) T, d(X/Z)/dS' = 1/Z^2 and d(Y/Z) = dT'/Z - Y sin(b) dS'/Z^2. What spans w px meets at most floor(w) + 2
+    columns or rows, and a straight line in so many columns and rows one pixel fewer than they are together.
+    """
+    camera = scene.camera
+    cos_a, sin_a, sin_b = (float(np.abs(side[0])) + float(off[0]) for side, off in _sizes(turns))
+    sides = np.abs([camera.u0, camera.width - camera.u0]).max() / camera.focal_u_px
+    heights = np.abs([camera.v0, camera.height - camera.v0]).max() / camera.focal_v_px
+    aside, down = cos_a * sides + sin_a * heights, cos_a * heights + sin_a * sides
+    ahead = float(turns.cos_b[0] - turns.off_b[0]) - sin_b * aside
+    if ahead <= 0:
+        return camera.width * camera.height
+    across, fall = cos_a / camera.focal_u_px + sin_a / camera.focal_v_px, cos_a / camera.focal_v_px + sin_a / camera.focal_u_px
+    spans = camera.focal_u_px * across / ahead**2, camera.focal_v_px * (fall / ahead + down * sin_b * across / ahead**2)
+    columns, rows = (math.floor(span * (1 + 2.0**-30)) + 2 for span in spans)
+    return min(columns * rows, len(scene.runway.markings) * (columns + rows - 1))
+
+
+def _sizes(turns: Turns) -> tuple[tuple[Floats, Floats], ...]:
+    return (turns.cos_a, turns.off_a), (turns.sin_a, turns.off_a), (turns.sin_b, turns.off_b)
 
 
 def window_of(scene: Scene, sets: StateSet) -> tuple[slice, slice]:

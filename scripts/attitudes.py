@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, cast
 
 import joblib
 import numpy as np
@@ -102,14 +102,14 @@ def main(
     except ModelError as error:
         fail(error)
     work = [joblib.delayed(judged)(model, missed_budget, np.radians(largest_deg), part) for part in parts(frames, seed)]
-    done = joblib.Parallel(jobs, return_as="generator")(work)
+    done = cast(Iterator[list[tuple[str, Floats | None]]], joblib.Parallel(jobs, return_as="generator")(work))
     errors, console = terminal.console(stderr=True), terminal.console()
     results = [result for part in track(done, "frames", total=len(work), console=errors, transient=True) for result in part]
     violations = [text for text, widths in results if widths is None]
     for text in violations:
         console.print(f"violation: {text}", markup=False)
     held = [widths for _, widths in results if widths is not None]
-    medians = ", ".join(f"{width:.4g}" for width in np.median(held, axis=0)) if held else "-"
+    medians = " ".join(f"{np.median([widths[axis] for widths in held]):.4g}" for axis in range(4)) if held else "-"
     console.print(f"{len(results)} frames, {len(violations)} violations; half-widths, median: {medians}")
     if violations:
         raise typer.Exit(1)

@@ -49,11 +49,11 @@ class TurnedState:
     def attitude(self, rng: np.random.Generator, roll_plus_minus: float = 0.0, yaw_plus_minus: float = 0.0) -> Attitude:
         """A reading that is off by the plus-minus at most, which holds the true angles."""
         roll, _, yaw = self.angles
-        readings = (
+        readings = [
             float(angle.mid()) + rng.choice([-1.0, 1.0, rng.uniform(-1, 1)]) * plus_minus
             for angle, plus_minus in ((roll, roll_plus_minus), (yaw, yaw_plus_minus))
-        )
-        return Attitude(*readings, roll_plus_minus + HAIR, yaw_plus_minus + HAIR)
+        ]
+        return Attitude(readings[0], readings[1], roll_plus_minus + HAIR, yaw_plus_minus + HAIR)
 
     def within(self, lower: Floats, upper: Floats) -> bool:
         """Is the camera's state in this box, borders included?"""

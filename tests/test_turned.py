@@ -15,7 +15,9 @@ from turned_state import TurnedState
 
 from build_model.export import export_model
 from runtime import Attitude, Box, Estimator, Motion, Outcome, Scene, Tracker
-from runtime.turned import Bin, bins_of, grouped, met_by_one, painted
+from runtime.painting import painted
+from runtime.sensor import Sensor
+from runtime.turned import Bin, bins_of, grouped, joined, met_by_one, turned_map
 
 EstimatorOf = Callable[..., Estimator]
 SCALES = {"paper": PAPER, "strip": STRIP, "airport": AIRPORT}
@@ -67,9 +69,9 @@ def test_no_pixel_of_the_runway_is_lost_in_painting(scene: Scene) -> None:
         c = float(state.seen.floats[0])
         turns = Bin(np.array([[c - 1e-12, c + 1e-12]]), np.array([attitude.roll]), np.array([attitude.yaw])).turns
         ideal = RationalView.of(scene.to_dict()).image(state.seen).frame
-        canvas = painted(scene.camera, image(scene, state), turns).view(bool)
+        canvas = painted(image(scene, state), turned_map(Sensor.of(scene), turns)).view(bool)
         assert not (ideal & ~canvas).any(), number
-        unseen = painted(scene.camera, np.zeros(scene.camera.shape, dtype=bool), turns).view(bool)
+        unseen = painted(np.zeros(scene.camera.shape, dtype=bool), turned_map(Sensor.of(scene), turns)).view(bool)
         if not plus_minus.any():
             assert (canvas & ~unseen).sum() <= 4 * ideal.sum() + 9
 
@@ -85,7 +87,7 @@ def test_a_missed_pixel_spoils_no_more_of_the_ideal_image_than_is_budgeted() -> 
         for dark in rng.choice(np.flatnonzero(seen), 3, replace=False):
             frame = seen.copy()
             frame.ravel()[dark] = False
-            assert (ideal & ~painted(PAPER.camera, frame, turns).view(bool)).sum() <= met_by_one(PAPER, turns) <= 9
+            assert (ideal & ~painted(frame, turned_map(Sensor.of(PAPER), turns)).view(bool)).sum() <= met_by_one(PAPER, turns) <= 9
 
 
 def test_bins_cover_the_attitude() -> None:
@@ -105,7 +107,7 @@ def test_hulls_of_entries_hold_them(estimator_of: EstimatorOf) -> None:
     state = drawn(FREE_X, rng, 0.05)
     found = free.find(image(FREE_X, state), state.attitude(rng, 0.004, 0.004))
     assert found.turned is not None
-    entries = found.turned.entries
+    entries = joined(*(sets for _, sets in found.turned.parts))
     few = grouped(entries, 20)
     assert len(few) < len(entries)
     for name in ("theta", "x", "y", "z", "roll", "yaw"):

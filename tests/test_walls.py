@@ -31,6 +31,7 @@ SHARED_WITH_VERIFIER = {
     "runtime",
     "runtime.assumptions",  # words
     "runtime.errors",
+    "runtime.ideal",  # which scene the ideal frame has
     "runtime.model",
     "runtime.model.format",
     "runtime.model.limits",  # numbers

@@ -8,6 +8,8 @@ What is proved, and by what arithmetic:
     boxes      of states, scales and reference rows are what the refinement takes for granted (`build_model.verify.box_claims`)
     sizes      |K|, its least value, the budgets' defaults and the stated assumptions agree: integers
     masks, boxes and cover of every cell (`build_model.verify.cell_proof`): Arb's balls of 64 bits, from the plain camera equations
+    lens       does not fold within the frame, and NN_F is that of a pinhole with the sensor's focal lengths: Arb's balls. Not proved: the
+               table of its inverse, which the runtime certifies itself (`build_model.verify.lens_proof`)
     tolerance  line_px covers what the calibration can move a marking by (`build_model.verify.displacement`): Arb's balls
 
 No mask, bound or rounding of the build is used; shared with it are the scene's reader and the writer of the expected graph.
@@ -36,10 +38,12 @@ from build_model.verify.cell_claim import cell_claims
 from build_model.verify.cell_proof import CellProof, prove_cell
 from build_model.verify.counterexample import Counterexample, Refuted, demand
 from build_model.verify.displacement import displacement_px
+from build_model.verify.lens_proof import check_lens
 from build_model.verify.model_graph import check_graph, read_tables
 from build_model.verify.outputs import check_outputs
 from runtime.assumptions import assumptions
 from runtime.errors import one_line
+from runtime.ideal import ideal_scene
 from runtime.model.format import METADATA_KEY, PADDING_SIZE, ModelError
 from runtime.model.model_file import parse_model
 from runtime.scene import Axis, Scene, SceneError
@@ -87,13 +91,15 @@ def verify_model(path: str | Path, jobs: int = 1, progress: Progress = _silent) 
     counterexample, shift_px, cells = None, float("nan"), 0
     try:
         cells = len(cell_boxes(scene))
-        tables, shift_px = _check_all_but_masks(model, metadata, scene)
-        for proof in _cell_proofs(scene, tables, jobs):
+        ideal = _ideal_of(scene, metadata)
+        demand(metadata.get("assumptions") == assumptions(scene), "metadata: the assumptions are not the scene's")
+        tables, shift_px = _check_all_but_masks(model, metadata, ideal)
+        for proof in _cell_proofs(ideal, tables, jobs):
             if isinstance(proof, Counterexample):
                 raise Refuted(proof)
             proofs.append(proof)
             progress(len(proofs), cells)
-        check_outputs(content, scene, tables)
+        check_outputs(content, ideal, tables)
     except Refuted as refuted:
         counterexample = refuted.counterexample
     return VerificationReport(
@@ -136,6 +142,23 @@ def _opened(content: bytes, name: str) -> tuple[onnx.ModelProto, dict[str, Any],
         raise ModelError(f"{name}: the scene in its metadata is unusable ({error}); export it again with export-model") from error
 
 
+def _ideal_of(scene: Scene, metadata: dict[str, Any]) -> Scene:
+    """The scene that NN_F is claimed to be built for: its own, or behind a lens that of the ideal frame. Raises `Refuted`."""
+    stated = metadata.get("ideal_camera"), metadata.get("ideal_pixels_a_pixel")
+    if scene.camera.pinhole:
+        demand(stated == (None, None), "metadata: an ideal camera is stated of a scene without a lens")
+        return scene
+    camera, count = stated
+    usable = isinstance(camera, dict) and isinstance(count, int) and not isinstance(count, bool) and count >= 1
+    demand(usable, "metadata: ideal_camera or ideal_pixels_a_pixel is missing")
+    try:
+        ideal = ideal_scene(scene, Scene.from_dict({**scene.to_dict(), "camera": camera}).camera, cast(int, count))
+    except SceneError as error:
+        raise Refuted(Counterexample(f"metadata: ideal_camera is unusable ({error})")) from error
+    check_lens(scene.camera, scene.calibration, ideal.camera)
+    return ideal
+
+
 def axis_borders(axis: Axis) -> list[float]:
     """Borders of an axis's cells, ascending: half-way between its centres, and half a width beyond the outermost.
 
@@ -161,7 +184,6 @@ def _check_all_but_masks(model: onnx.ModelProto, metadata: dict[str, Any], scene
     least = tables.smallest_must_light
     demand(metadata.get("smallest_must_light") == least, f"metadata: smallest_must_light is not {least}, the least |K| of the file")
     demand(least > scene.tolerance.missed_budget, f"the least |K|, {least}, does not exceed the missed budget")
-    demand(metadata.get("assumptions") == assumptions(scene), "metadata: the assumptions are not the scene's")
     _check_whole_cells(model, cells, tables)
     check_boxes(scene, tables)
     shift_px = displacement_px(scene, tables.window)

@@ -25,11 +25,11 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from runtime.camera import project
 from runtime.estimate import Box, Estimate
 from runtime.explanation import Explanation, dark_pixels
-from runtime.image import image_of_ends
+from runtime.image import runway_image
 from runtime.scene import STATE_NAMES, STATE_UNITS, Scene
+from runtime.sensor_image import sensor_curves
 
 Picture = NDArray[np.uint8]
 Colour = tuple[int, int, int]
@@ -43,6 +43,8 @@ BOX_LIGHT = 0.16
 """Share of its colour that the box adds to what lies under it: blue stays blue, dark turns amber."""
 SAMPLES = 5
 """States an axis at which a box is projected."""
+BOX_POINTS = 9
+"""Points of each marking's curve behind a lens, in one of these."""
 FRACTION_BITS = 4
 """Lines are placed to a 16th of a picture's pixel."""
 END_RADIUS = 4
@@ -170,24 +172,37 @@ def runway_view(
 
 def _extent(scene: Scene, states: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """First and last (row, column) of the frame that the states' runways light; where they light none, the place nearest to them."""
-    ends = project(scene, states[np.isfinite(states).all(axis=1)])
-    lit = np.argwhere(image_of_ends(ends, scene.camera.shape).any(axis=0))
+    states = states[np.isfinite(states).all(axis=1)]
+    lit = np.argwhere(runway_image(scene, states).any(axis=0))
     if len(lit) == 0:
-        centre = ends.mean(axis=(0, 1, 2))[::-1] if len(ends) else np.zeros(2)
+        curves = sensor_curves(scene, states)
+        centre = np.nan_to_num(curves).mean(axis=(0, 1, 2))[::-1] if len(states) else np.zeros(2)
         nearest = np.clip(centre, 0, scene.camera.shape)
         return nearest, nearest
     return lit.min(axis=0), lit.max(axis=0) + 1.0
 
 
 def box_outlines(scene: Scene, box: Box) -> NDArray[np.float64]:
-    """Ends of every marking at `SAMPLES` states an axis of the box, corners included: (markings, points, 2) px.
+    """Every marking's ends, or points of its curve, at `SAMPLES` states an axis of the box, corners included: (markings, points, 2) px.
 
     Every sampled marking lies in the convex hull of its row.
     """
     sides = zip(box.lower, box.upper, strict=True)
     axes = [np.unique(np.linspace(low, high, SAMPLES)) for low, high in sides]
     states = np.array(list(itertools.product(*axes)))
-    return np.moveaxis(project(scene, states), 1, 0).reshape(len(scene.runway.markings), -1, 2)
+    outlines = np.moveaxis(sensor_curves(scene, states, BOX_POINTS), 1, 0).reshape(len(scene.runway.markings), -1, 2)
+    return outlines[:, np.isfinite(outlines).all(axis=(0, 2))]
+
+
+def _seen(scene: Scene, state: ArrayLike) -> NDArray[np.float64]:
+    """The curves of the markings that the camera shows something of, (markings, points, 2) px."""
+    curves = sensor_curves(scene, state)
+    return curves[np.isfinite(curves).all(axis=(1, 2))]
+
+
+def _ends(scene: Scene, state: ArrayLike) -> NDArray[np.float64]:
+    """Near and far end of each of those, (markings, 2, 2) px."""
+    return _seen(scene, state)[:, [0, -1]]
 
 
 def colour_pixels(frame: NDArray, filtered: NDArray, mask: NDArray[np.bool_] | None) -> Picture:
@@ -251,12 +266,12 @@ def _draw_states(
         panel[:] = cv2.addWeighted(filled, BOX_LIGHT, panel, 1, 0)
         cv2.polylines(panel, hulls, True, BOX, 1, cv2.LINE_AA, FRACTION_BITS)
     if truth is not None:
-        for u, v in view.points(project(scene, truth)).reshape(-1, 2).tolist():
+        for u, v in view.points(_ends(scene, truth)).reshape(-1, 2).tolist():
             cv2.circle(panel, (u, v), END_RADIUS << FRACTION_BITS, TRUTH, 1, cv2.LINE_AA, FRACTION_BITS)
     nearest = None if explanation is None else explanation.nearest.state
     for state, colour in ((nearest, NEAREST), (truth, TRUTH), (estimate.state, STATE)):
         if state is not None:
-            cv2.polylines(panel, list(view.points(project(scene, state))), False, colour, 1, cv2.LINE_AA, FRACTION_BITS)
+            cv2.polylines(panel, list(view.points(_seen(scene, state))), False, colour, 1, cv2.LINE_AA, FRACTION_BITS)
 
 
 def _text_strip(

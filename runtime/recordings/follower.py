@@ -47,6 +47,8 @@ class Follower:
             raise TrackingError(f"--{error}") from error
         readings = None if attitude is None else AttitudeReadings.load(attitude)
         turned = readings is not None and not pitch_alone and not _level(estimator, readings)
+        if turned and not estimator.scene.calibration.exact:
+            raise TrackingError(f"--attitude: {attitude} tells a roll or yaw, the scene a plus-minus in [calibration]; give --pitch-alone")
         return Follower(tracker, readings, turned, _description(tracker, readings, attitude, turned))
 
     def known(self, instant_us: float) -> tuple[Attitude | None, Box | None]:

@@ -1,0 +1,230 @@
+"""A frame of the sensor painted outward onto the ideal frame, for NN_F (docs/guarantee.md, "A lens").
+
+A pixel of the sensor shows, of the ideal frame, what lies within the quadrilateral of its corners' images, which may each lie anywhere
+in an interval (`runtime.sensor_map`), its edges bowed by `bow_px` at most. *Painted* is every ideal pixel that meets what some lit pixel
+shows, and every one that is not certainly shown as a whole by the sensor.
+
+Claim. Let a point of the runway lie in the ideal frame. If it lies in an ideal pixel that the sensor shows as a whole, the sensor's pixel
+which shows it is in the frame; and if that one is lit, the ideal pixel is painted. So where at most m pixels of the sensor's image of the
+runway are dark, at most c m pixels of the ideal image are, `c` being a bound on how many ideal pixels all markings together meet within
+what one sensor's pixel shows: Theorem A holds of the painted frame with budget c m.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.refine.interval import Floats, Interval
+from runtime.rounding import OUTWARD_PX, ROUNDING_SHARE
+from runtime.scene import Scene
+from runtime.sensor_map import SensorMap
+
+Bits = NDArray[np.bool_]
+Integers = NDArray[np.int64]
+
+CORNERS = ((0, 0), (0, 1), (1, 1), (1, 0))
+"""Rows and columns of a pixel's corners, in turn around it."""
+BLOCK_PX = 16
+"""Sides of the blocks of the ideal frame that are looked at before their pixels are."""
+MOST_PAINTED = 64
+"""Ideal pixels that one pixel of the sensor may show: where there are more, it paints all of the ideal frame."""
+PARCEL = 2**16
+"""Pixels of the sensor of which tables are made at a time."""
+
+
+@dataclass(frozen=True)
+class Painting:
+    """What every pixel of one sensor paints, for maps that do not change from frame to frame."""
+
+    shape: tuple[int, int]
+    """(height, width) of the ideal frame."""
+    window: tuple[slice, slice]
+    """Rows and columns of the sensor of which some may show something of the ideal frame."""
+    table: NDArray[np.int32]
+    """(pixels of the window, most): flat numbers of the ideal pixels that each paints, filled up with that of none, height * width."""
+    everything: Bits
+    """Pixels of the window that paint everything, (pixels,)."""
+    unseen: Bits
+    """Ideal pixels that the sensor does not certainly show as a whole, (height * width,)."""
+
+    @staticmethod
+    def of(sensor: SensorMap) -> Painting:
+        """The painting of a map."""
+        window = sensor_window(sensor)
+        rows, columns = (side.ravel() for side in np.mgrid[window])
+        parcels = [what_pixels_show(sensor, rows[at : at + PARCEL], columns[at : at + PARCEL]) for at in range(0, len(rows), PARCEL)]
+        most = max((part[0].shape[1] for part in parcels), default=1)
+        none = sensor.ideal.height * sensor.ideal.width
+        table = np.full((len(rows), most), none, dtype=np.int32)
+        for at, (part, _) in enumerate(parcels):
+            table[at * PARCEL : at * PARCEL + len(part), : part.shape[1]] = part
+        everything = np.concatenate([part[1] for part in parcels]) if parcels else np.zeros(0, dtype=bool)
+        return Painting(sensor.ideal.shape, window, table, everything, ~shown_whole(sensor).ravel())
+
+    def painted(self, frame: Bits) -> NDArray[np.uint8]:
+        """The ideal frame, uint8 of {0, 1}, of a frame of the sensor."""
+        lit = np.flatnonzero(frame[self.window])
+        canvas = np.zeros(len(self.unseen) + 1, dtype=np.uint8)
+        canvas[:-1] = self.unseen
+        canvas[self.table[lit]] = 1
+        if self.everything[lit].any():
+            canvas[:] = 1
+        return canvas[:-1].reshape(self.shape)
+
+    def seen_in(self, mask: Bits, shape: tuple[int, int]) -> Bits:
+        """The pixels of a sensor's frame of this shape that show some pixel of a mask of the ideal frame."""
+        flat = np.append(mask.ravel(), False)
+        seen = np.zeros(shape, dtype=bool)
+        rows, columns = (side.stop - side.start for side in self.window)
+        seen[self.window] = (flat[self.table].any(axis=1) | self.everything).reshape(rows, columns)
+        return seen
+
+
+def painted(frame: Bits, sensor: SensorMap) -> NDArray[np.uint8]:
+    """The ideal frame, uint8 of {0, 1}, of one frame (height, width) of the sensor, for a map that is this frame's own."""
+    window = sensor_window(sensor)
+    rows, columns = np.nonzero(frame[window])
+    canvas = np.zeros(sensor.ideal.height * sensor.ideal.width + 1, dtype=np.uint8)
+    canvas[:-1] = ~shown_whole(sensor).ravel()
+    if len(rows):
+        table, everything = what_pixels_show(sensor, rows + window[0].start, columns + window[1].start)
+        canvas[table] = 1
+        if everything.any():
+            canvas[:] = 1
+    return canvas[:-1].reshape(sensor.ideal.shape)
+
+
+def sensor_window(sensor: SensorMap) -> tuple[slice, slice]:
+    """Rows and columns of the sensor outside which nothing of the ideal frame is shown."""
+    tops, lefts = (np.arange(0, side, BLOCK_PX, dtype=np.float64) for side in sensor.ideal.shape)
+    height, width = sensor.ideal.shape
+    u, v = np.meshgrid(lefts, tops)
+    column, row = sensor.to_sensor((u, np.minimum(u + BLOCK_PX, width)), (v, np.minimum(v + BLOCK_PX, height)))
+    return _within(row, sensor.camera.height), _within(column, sensor.camera.width)
+
+
+def _within(side: Interval, size: int) -> slice:
+    low, high = np.clip([side[0].min(), side[1].max()], 0, size)
+    return slice(math.floor(low), math.ceil(high))
+
+
+def shown_whole(sensor: SensorMap) -> Bits:
+    """The pixels of the ideal frame, (height, width), that the sensor shows as a whole, whatever the rotation and calibration."""
+    height, width = sensor.ideal.shape
+    shown = np.ones((height, width), dtype=bool)
+    tops, lefts = np.arange(0, height, BLOCK_PX), np.arange(0, width, BLOCK_PX)
+    rows, columns = (side.ravel() for side in np.meshgrid(tops, lefts, indexing="ij"))
+    unsure = ~_inside(sensor, rows, columns, BLOCK_PX)
+    if unsure.any():
+        offsets = np.arange(BLOCK_PX)
+        rows = np.broadcast_to((rows[unsure, None, None] + offsets[:, None]), (unsure.sum(), BLOCK_PX, BLOCK_PX)).ravel()
+        columns = np.broadcast_to((columns[unsure, None, None] + offsets), (unsure.sum(), BLOCK_PX, BLOCK_PX)).ravel()
+        kept = (rows < height) & (columns < width)
+        rows, columns = rows[kept], columns[kept]
+        shown[rows, columns] = _inside(sensor, rows, columns, 1)
+    return shown
+
+
+def _inside(sensor: SensorMap, rows: Integers, columns: Integers, size: int) -> Bits:
+    """True for squares of the ideal frame that lie within the sensor's frame."""
+    u, v = columns.astype(np.float64), rows.astype(np.float64)
+    column, row = sensor.to_sensor((u, u + size), (v, v + size))
+    return (column[0] >= 0) & (column[1] <= sensor.camera.width) & (row[0] >= 0) & (row[1] <= sensor.camera.height)
+
+
+def what_pixels_show(sensor: SensorMap, rows: Integers, columns: Integers) -> tuple[NDArray[np.int32], Bits]:
+    """Flat numbers of the ideal pixels that each of some pixels of the sensor paints, (pixels, most), and which paint everything.
+
+    Ideal pixels of the box around the quadrilateral are left out where one of its edges, moved outward, has them on its other side.
+    """
+    height, width = sensor.ideal.shape
+    corners = [sensor.corners(rows + down, columns + right) for down, right in CORNERS]
+    u, v = (tuple(np.stack([corner[axis][side] for corner in corners]) for side in (0, 1)) for axis in (0, 1))
+    seen = np.isfinite(u[1]).all(axis=0) & np.isfinite(v[1]).all(axis=0)
+    u, v = ((np.where(seen, side[0], 0.0), np.where(seen, side[1], 0.0)) for side in (u, v))
+    bow = sensor.bow_px
+    left, right = (np.floor(side).astype(np.int64) for side in (u[0].min(axis=0) - bow, u[1].max(axis=0) + bow))
+    top, bottom = (np.floor(side).astype(np.int64) for side in (v[0].min(axis=0) - bow, v[1].max(axis=0) + bow))
+    far = (right - left >= MOST_PAINTED) | (bottom - top >= MOST_PAINTED)
+    out = (right < 0) | (left >= width) | (bottom < 0) | (top >= height)
+    everything = ~seen | (far & ~out)
+    none = everything | out
+    right, bottom = np.where(none, left, right), np.where(none, top, bottom)
+    limits = _limits((u[0] - left, u[1] - left), (v[0] - top, v[1] - top), bow)
+    table = []
+    for down in range(int((bottom - top).max(initial=0)) + 1):
+        for aside in range(int((right - left).max(initial=0)) + 1):
+            row, column = top + down, left + aside
+            met = ~none & (row <= bottom) & (column <= right) & (row >= 0) & (row < height) & (column >= 0) & (column < width)
+            for across, along, limit in limits:
+                met &= across * aside + along * down + np.minimum(across, 0) + np.minimum(along, 0) <= limit
+            table.append(np.where(met, row * width + column, height * width))
+    ordered = np.sort(np.stack(table, axis=1).astype(np.int32), axis=1)
+    most = int((ordered < height * width).sum(axis=1).max(initial=1))
+    return ordered[:, : max(most, 1)], everything
+
+
+def _limits(u: Interval, v: Interval, bow: float) -> list[tuple[Floats, Floats, Floats]]:
+    """For each edge a normal (across, along), and what its product with a point of what the pixel shows is at most."""
+    middle_u, middle_v = (u[0] + u[1]) / 2, (v[0] + v[1]) / 2
+    half_u, half_v = (u[1] - u[0]) / 2, (v[1] - v[0]) / 2
+    limits = []
+    for corner in range(len(CORNERS)):
+        following = (corner + 1) % len(CORNERS)
+        across, along = middle_v[following] - middle_v[corner], middle_u[corner] - middle_u[following]
+        reach = across * middle_u + along * middle_v + np.abs(across) * half_u + np.abs(along) * half_v
+        limits.append((across, along, reach.max(axis=0) + (bow + OUTWARD_PX) * (np.abs(across) + np.abs(along))))
+    return limits
+
+
+def ideal_pixels_a_pixel(scene: Scene, sensor: SensorMap, painting: Painting) -> int:
+    """c: how many ideal pixels all markings together can meet within what one pixel of the sensor shows, at most.
+
+    A straight line meets no more pixels than 1 and the borders of columns and of rows that it crosses; where it is w wide and h tall
+    those are floor(w) + 1 and floor(h) + 1. A marking's line is never flatter than the domain allows, and lines of unlike p_x are as far
+    apart as their p_x at the farthest distance; so many of them as may meet one pixel are counted.
+    """
+    rows, columns = (side.ravel() for side in np.mgrid[painting.window])
+    used = (painting.table < len(painting.unseen)).any(axis=1) & ~painting.everything
+    if not used.any():
+        return 1
+    wide, tall = _extents(sensor, rows[used], columns[used])
+    flattest, px_per_m = _flattest(scene, sensor), _least_scale(scene, sensor)
+    across = np.minimum(wide, flattest * tall)
+    a_line = 1 + np.floor(across * (1 + ROUNDING_SHARE)) + 1 + np.floor(tall * (1 + ROUNDING_SHARE)) + 1
+    lines = _most_within(scene.runway.x_m, float(((wide + flattest * tall) / px_per_m).max() * (1 + ROUNDING_SHARE)))
+    return lines * int(a_line.max())
+
+
+def _extents(sensor: SensorMap, rows: Integers, columns: Integers) -> tuple[Floats, Floats]:
+    """Width and height, px of the ideal frame, of what pixels show."""
+    corners = [sensor.corners(rows + down, columns + right) for down, right in CORNERS]
+    sides = []
+    for axis in (0, 1):
+        low = np.minimum.reduce([corner[axis][0] for corner in corners])
+        high = np.maximum.reduce([corner[axis][1] for corner in corners])
+        sides.append(high - low + 2 * (sensor.bow_px + OUTWARD_PX))
+    return sides[0], sides[1]
+
+
+def _flattest(scene: Scene, sensor: SensorMap) -> float:
+    """Most columns a row that a marking runs across: |p_x - x| (F_u/F_v) cos(theta)/y."""
+    lower, upper = scene.domain.lower, scene.domain.upper
+    lever_m = max(float(scene.runway.x_m.max() - lower[1]), float(upper[1] - scene.runway.x_m.min()), 0.0)
+    return lever_m * sensor.ideal.focal_u_px / sensor.ideal.focal_v_px / float(lower[2]) * (1 + ROUNDING_SHARE)
+
+
+def _least_scale(scene: Scene, sensor: SensorMap) -> float:
+    """Fewest px per metre across the runway at any point of a marking: F_u/Z, Z no more than the distance."""
+    farthest = math.hypot(float(scene.domain.upper[2]), float(scene.domain.upper[3] + scene.runway.ends_z_m.max()))
+    return sensor.ideal.focal_u_px / farthest * (1 - ROUNDING_SHARE)
+
+
+def _most_within(x_m: Floats, span_m: float) -> int:
+    """How many of the unlike p_x lie within a span at most."""
+    places = np.unique(x_m)
+    return int(max(np.searchsorted(places, place + span_m, side="right") - at for at, place in enumerate(places)))
