@@ -61,6 +61,8 @@ class Search:
     roll: int = 1
     yaw: int = 1
     """As `theta`, where these are known up to a plus-minus alone."""
+    patience: int = 1
+    """So many rounds in a row must take less than the share."""
 
 
 FACES = 6
@@ -70,8 +72,8 @@ SOME_MISSED = Search(first=4, theta=3, z=2, scale=2, pieces=4, rounds=20, gain=0
 """Missed pixels are counted where windows are a pixel or two wide (`missed`): then smaller pieces pay, cut along the scale too."""
 NARROWED = Search(first=4, theta=3, z=2, scale=2, pieces=4, rounds=20, gain=0.002)
 """Pixels may be missed, and the entries were cut to a prior: they are few, so that there is time for small gains."""
-TURNED = Search(first=2, theta=2, z=1, scale=1, pieces=8, rounds=40, gain=0.002, roll=2, yaw=2)
-"""Roll and yaw are known up to a plus-minus alone: half of it then tells more than half of a slice."""
+TURNED = Search(first=2, theta=2, z=1, scale=1, pieces=16, rounds=80, gain=0.002, roll=2, yaw=2, patience=3)
+"""Roll and yaw are known up to a plus-minus alone: half of it then tells more than half of a slice, and many pieces carry one face."""
 LEAST_SWAY_PX = 0.25
 """A plus-minus that moves no point of the frame by this much is not cut."""
 LARGEST_START = 512
@@ -111,13 +113,14 @@ class Refiner:
         finer_cuts = {name: getattr(search, name) for name in ("theta", "z", "scale", "roll", "yaw")}
         a_face = min(max(most_sets // (FACES * math.prod(finer_cuts.values())), 1), search.pieces)
         pieces = self._contracted(witnesses, vouched, _cut(entries, theta=slices, roll=search.roll, yaw=search.yaw))
-        extent = _extent(pieces)
+        extent, idle = _extent(pieces), 0
         for _ in range(search.rounds if len(pieces) else 0):
             outer = _carries_a_face(pieces, a_face)
             finer = self._contracted(witnesses, vouched, _cut(pieces[outer], **finer_cuts))
             pieces, before = joined(finer, pieces[~outer]), extent
             extent = _extent(pieces)
-            if (extent > (1 - search.gain) * before).all():
+            idle = idle + 1 if (extent > (1 - search.gain) * before).all() else 0
+            if idle == search.patience:
                 break
         return pieces
 
