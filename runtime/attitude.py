@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.rounding import lowered, raised
-from runtime.scene import Mount
+from runtime.scene import LARGEST_TURN_RAD, Mount
 from runtime.turn import arctangent, cosine_and_sine
 
 Floats = NDArray[np.float64]
@@ -31,8 +31,6 @@ Interval = tuple[Floats, Floats]
 
 STEEPEST_SINE = 0.9999
 """Of a camera's pitch: one that looks farther down has no roll to speak of."""
-LARGEST_ANGLE_RAD = 0.75
-"""Largest roll or yaw, plus-minus included: a camera that is turned farther sees its runway sideways."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +38,7 @@ class Attitude:
     """Roll and yaw of the camera, each known up to a plus-minus: roll is positive with the right wing down, yaw with the nose to the right
     of the runway's direction.
 
-    Raises ValueError for angles that are not finite, a plus-minus below 0, or more than `LARGEST_ANGLE_RAD` in all.
+    Raises ValueError for angles that are not finite, a plus-minus below 0, or more than `LARGEST_TURN_RAD` in all.
     """
 
     roll_rad: float
@@ -53,8 +51,8 @@ class Attitude:
             object.__setattr__(self, field.name, float(getattr(self, field.name)))
         for name in ("roll", "yaw"):
             angle, plus_minus = getattr(self, f"{name}_rad"), getattr(self, f"{name}_plus_minus_rad")
-            if not (math.isfinite(angle) and plus_minus >= 0 and abs(angle) + plus_minus <= LARGEST_ANGLE_RAD):
-                expected = f"give a plus-minus of 0 or more, and at most {LARGEST_ANGLE_RAD} rad with it"
+            if not (math.isfinite(angle) and plus_minus >= 0 and abs(angle) + plus_minus <= LARGEST_TURN_RAD):
+                expected = f"give a plus-minus of 0 or more, and at most {LARGEST_TURN_RAD} rad with it"
                 raise ValueError(f"attitude: found {name}_rad {angle} +- {plus_minus}; {expected}")
 
     @staticmethod

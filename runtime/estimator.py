@@ -78,6 +78,8 @@ class Estimator:
         self._session = open_session(model.content, name, threads)
         check_interface(self._session, self.ideal, model.tensors["must_light_size"].shape, name)
         self.domain = Box(self.scene.domain.lower, self.scene.domain.upper)
+        bounds = self.scene.attitude
+        self.attitude = None if bounds is None else Attitude.between(bounds.roll_rad, bounds.yaw_rad)
         self._fixed = self.domain.lower == self.domain.upper
         window = self._entries.window_and_beyond(REFINED_BEYOND_PX)
         self._refiner = Refiner(self.ideal, int(self._budgets["missed_budget"]), int(self._budgets["extra_budget"]), window)
@@ -162,10 +164,11 @@ class Estimator:
         `frame`: (height, width), bool, or uint8 of {0, 1}. `proposal`: a state (4,) from elsewhere to be checked in place of NN_e's.
         `refine`: contract the passing entries to what the frame can tell (`runtime.refine`); without it, the box is their hull. `prior`: a
         box that is known to hold the state (Theorem C); if it contradicts a frame which has a state without it, the outcome is
-        INCONSISTENT. `attitude`: roll and yaw of the camera, by default none; the frame is its sensor's own (`runtime.turned`), and
+        INCONSISTENT. `attitude`: roll and yaw of the camera, by default the scene's; the frame is its sensor's own (`runtime.turned`), and
         Theorem A alone is used. Raises `FrameError` for any other frame and ValueError for a proposal of another shape.
         """
         state = None if proposal is None else self._checked_proposal(proposal)
+        attitude = attitude or self.attitude
         found = self.find(frame, attitude, prior)
         if prior is None:
             return self._alone(found, refine, state)

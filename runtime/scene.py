@@ -48,6 +48,8 @@ DISTORTIONS = {"radial-tangential": (4, 5), "fisheye": (4,)}
 """Models of a lens, and how many coefficients each has."""
 LARGEST_COEFFICIENT = 1e3
 """Largest coefficient of a lens: far beyond any that is real, so that none overflows."""
+LARGEST_TURN_RAD = 0.75
+"""Largest roll or yaw of a camera, its plus-minus included: one that is turned farther sees its runway sideways."""
 INSTANTS = {"start": 0.0, "middle": 0.5, "end": 1.0}
 """Instants of a window of events, and the share of it that lies before them."""
 MOST_ITEMS = 2**12
@@ -391,6 +393,20 @@ class MotionBounds:
 
 
 @dataclass(frozen=True)
+class AttitudeBounds:
+    """The camera's roll and yaw, least and largest, where no reference tells them."""
+
+    roll_rad: tuple[float, float] = (0.0, 0.0)
+    yaw_rad: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            low, high = getattr(self, field.name)
+            usable = -LARGEST_TURN_RAD <= low <= high <= LARGEST_TURN_RAD
+            _demand(usable, f"attitude.{field.name}", [low, high], f"give the least and the largest, within {LARGEST_TURN_RAD} rad")
+
+
+@dataclass(frozen=True)
 class EventWindow:
     """The instant of a window of events that a certificate speaks of: at it, no more than the budget of the runway's pixels are dark."""
 
@@ -434,6 +450,7 @@ class Scene:
     estimator: EstimatorTraining = EstimatorTraining()
     motion: MotionBounds | None = None
     window: EventWindow | None = None
+    attitude: AttitudeBounds | None = None
 
     def __post_init__(self) -> None:
         low, high = self.domain.lower, self.domain.upper
@@ -444,6 +461,8 @@ class Scene:
         ahead = -widest <= flattest and steepest <= widest
         _demand(ahead, "domain", "a state with the runway behind the camera (Z <= 0)", "narrow theta_rad, y_m or z_m")
         self._check_margin(nearest, farthest)
+        told = self.attitude is None or self.calibration.exact
+        _demand(told, "attitude", "a roll or yaw beside a plus-minus in [calibration]", "add that of roll and yaw to [attitude] instead")
 
     def _check_margin(self, nearest: float, farthest: float) -> None:
         """The margin of `runtime.rounding` is twice float64's error on rows and columns in view, or more. Raises `SceneError`.

@@ -85,11 +85,12 @@ class Tracker:
 
         `prior`: a box that is known to hold the state now. `displacement`: bounds on how far the state has moved since the last frame that
         was followed, by axis: {"theta": (low, high)}; axes that are not named follow the motion. `attitude`: of the camera now, by default
-        level. Where frame, prior and the frames before
+        the scene's. Where frame, prior and the frames before
         contradict each other, the outcome is INCONSISTENT, and the tracker goes on from this frame alone. A frame in which no state fits
         by itself is not followed. A frame older than the last one is estimated by itself and counted in `late`. Raises `FrameError` as
         `Estimator.estimate` does, and ValueError for a displacement of another axis, or of bounds that are not ordered.
         """
+        attitude = attitude or self.estimator.attitude
         step = self._step(time_us, displacement)
         if step is None:
             self.late += 1

@@ -3,9 +3,9 @@
     python scripts/compare_attitude.py [MODEL.onnx] [--frames 40] [--seed 1]
 
 With x and yaw known exactly, where the runway is seen across the frame tells the pitch; so x is free. Without a model, the paper's
-scene with such an x is built first (`free_scene`, a minute or two). Each row is one way of knowing the attitude, on clean frames: medians of the
-half-widths of theta, x, y and z, their ratio to those of the level camera at the same states, with the same pitch reference, runs of NN_F
-and milliseconds a frame, and boxes without the state, of which there must be none. Exit code 1 if there is one.
+scene with such an x is built first (`free_scene`, a minute or two). Each row is one way of knowing the attitude, on clean frames: medians
+of the half-widths of theta, x, y and z, their ratio to those of the level camera at the same states, with the same pitch reference, runs
+of NN_F and milliseconds a frame, and boxes without the state, of which there must be none. Exit code 1 if there is one.
 """
 
 from __future__ import annotations

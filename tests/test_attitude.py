@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from turned_state import TurnedState
 
 from runtime import Attitude
-from runtime.attitude import LARGEST_ANGLE_RAD, Angle, Turns, camera_pitch, lead, mounted, seen_pitch
-from runtime.scene import Mount
+from runtime.attitude import Angle, Turns, camera_pitch, lead, mounted, seen_pitch
+from runtime.scene import LARGEST_TURN_RAD, Mount
 from runtime.turn import arctangent
 
 Floats = NDArray[np.float64]
@@ -125,7 +125,7 @@ def test_the_angles_of_a_turned_state_are_those_of_its_matrix() -> None:
 @pytest.mark.parametrize("values", [(math.nan, 0.0), (0.0, math.inf), (0.0, 0.0, -0.1), (0.0, 0.0, 0.0, math.nan), (0.7, 0.0, 0.1)])
 def test_an_attitude_that_makes_no_sense_is_refused(values) -> None:
     with pytest.raises(
-        ValueError, match=rf"^attitude: found \w+_rad .*; give a plus-minus of 0 or more, and at most {LARGEST_ANGLE_RAD} rad"
+        ValueError, match=rf"^attitude: found \w+_rad .*; give a plus-minus of 0 or more, and at most {LARGEST_TURN_RAD} rad"
     ):
         Attitude(*values)
 

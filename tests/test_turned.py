@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from compare_limit import constant_network
 from rational_image import RationalState, RationalView
-from scenes import AIRPORT, CUT_LEFT, FREE_X, PAPER, STRIP
+from scenes import AIRPORT, CUT_LEFT, FREE_X, ONE_CELL, PAPER, STRIP
 from turned_state import TurnedState
 
 from build_model.export import export_model
 from runtime import Attitude, Box, Estimator, Motion, Outcome, Scene, Tracker
 from runtime.painting import painted
+from runtime.scene import AttitudeBounds
 from runtime.sensor import Sensor
 from runtime.turned import Bin, bins_of, grouped, joined, met_by_one, turned_map
 
@@ -207,3 +209,30 @@ def test_a_tracked_box_holds_the_state_while_the_camera_turns(settings: dict[str
         seen = seen + np.array([0.03, 0.0, -0.04, -0.04]) * 0.04
     assert np.median(narrower[2:], axis=0).max() < (1.5 if settings else 1.0)
     assert "roll" in tracker.update(frame, 160_000, attitude=attitude).assumed[1]
+
+
+# --- bounds of the scene ---
+
+
+def test_a_scenes_bounds_on_roll_and_yaw_are_taken_where_nothing_is_told(folder: Path) -> None:
+    bounds = AttitudeBounds((-0.004, 0.004), (-0.003, 0.003))
+    scene = replace(ONE_CELL, attitude=bounds)
+    path = folder / "bounds.onnx"
+    export_model(scene, path, estimator=constant_network(scene.camera.shape, folder / "constant.onnx"))
+    model, rng = Estimator.load(path), np.random.default_rng(9)
+    assert model.scene.attitude == bounds
+    assert model.assumed[1].startswith("Roll within -0.004 and 0.004 rad, yaw within -0.003 and 0.003 rad, and the camera")
+    tracker = Tracker(model, Motion(-0.01 * np.ones(4), 0.01 * np.ones(4)))
+    for number in range(3):
+        state = drawn(scene, rng, 0.002)
+        frame = image(scene, state)
+        box = model.estimate(frame).box
+        assert box is not None
+        assert state.within(box.lower, box.upper)
+        narrower = model.estimate(frame, attitude=state.attitude(rng)).box
+        assert narrower is not None
+        assert (narrower.half_widths <= box.half_widths + 1e-9).all()
+        followed = tracker.update(frame, number * 1e9)
+        assert followed.box is not None
+        assert state.within(followed.box.lower, followed.box.upper)
+        assert "painted frames" in followed.assumed[1]
