@@ -153,15 +153,24 @@ class Lens:
         """The least of `stretches`."""
         return float(self.stretches.min())
 
-    @cached_property
+    @property
     def curvature(self) -> float:
-        """Bound on |x''| where D(x(t)) runs along a straight line at speed 1: |D''| / stretch^3, |D''| <= 3/2 sup |f''| + 6 |p|.
+        """`curvature_within` on the whole disc."""
+        return self.curvature_within(self.radius)
 
-        With g = f/r, D''[u, u] has the radial part f'' c^2 + g' s^2 and the other one 2 g' c s, for a unit vector u at an angle of
-        cosine c; and g'(r), the mean of t f''(t r) over t from 0 to 1, is half of the largest |f''| up to there at most.
+    def curvature_within(self, radius: float) -> float:
+        """Bound on |x''|, |x| <= radius, where D(x(t)) runs along a straight line at speed 1: |D''| / stretch^3.
+
+        |D''| <= 3/2 sup |f''| + 6 |p|: with g = f/r, D''[u, u] has the radial part f'' c^2 + g' s^2 and the other one 2 g' c s, for a unit
+        vector u at an angle of cosine c; and g'(r), the mean of t f''(t r) over t from 0 to 1, is half of the largest |f''| up to there.
         """
         bend = np.maximum.accumulate(self.bounds.bend)
-        return float(((1.5 * bend + 6 * self._tangential_size) / self.stretches**3).max() * (1 + ROUNDING_SHARE))
+        kept = max(int(np.searchsorted(self.bounds.edges, radius)), 1)
+        return float(((1.5 * bend + 6 * self._tangential_size) / self.stretches**3)[:kept].max() * (1 + ROUNDING_SHARE))
+
+    def stretch_within(self, radius: float) -> float:
+        """The least of `stretches` up to a radius."""
+        return float(self.stretches[: max(int(np.searchsorted(self.bounds.edges, radius)), 1)].min())
 
     @cached_property
     def rounding(self) -> float:

@@ -26,7 +26,7 @@ from runtime.sensor_map import SensorMap
 Bits = NDArray[np.bool_]
 Integers = NDArray[np.int64]
 
-CORNERS = ((0, 0), (0, 1), (1, 1), (1, 0))
+DOWN, RIGHT = np.array([[0], [0], [1], [1]]), np.array([[0], [1], [1], [0]])
 """Rows and columns of a pixel's corners, in turn around it."""
 BLOCK_PX = 16
 """Sides of the blocks of the ideal frame that are looked at before their pixels are."""
@@ -54,8 +54,8 @@ class Painting:
     @staticmethod
     def of(sensor: SensorMap) -> Painting:
         """The painting of a map."""
-        window = sensor_window(sensor)
-        rows, columns = (side.ravel() for side in np.mgrid[window])
+        view = View.of(sensor)
+        rows, columns = (side.ravel() for side in np.mgrid[view.window])
         parcels = [what_pixels_show(sensor, rows[at : at + PARCEL], columns[at : at + PARCEL]) for at in range(0, len(rows), PARCEL)]
         most = max((part[0].shape[1] for part in parcels), default=1)
         none = sensor.ideal.height * sensor.ideal.width
@@ -63,7 +63,7 @@ class Painting:
         for at, (part, _) in enumerate(parcels):
             table[at * PARCEL : at * PARCEL + len(part), : part.shape[1]] = part
         everything = np.concatenate([part[1] for part in parcels]) if parcels else np.zeros(0, dtype=bool)
-        return Painting(sensor.ideal.shape, window, table, everything, ~shown_whole(sensor).ravel())
+        return Painting(sensor.ideal.shape, view.window, table, everything, ~view.shown.ravel())
 
     def painted(self, frame: Bits) -> NDArray[np.uint8]:
         """The ideal frame, uint8 of {0, 1}, of a frame of the sensor."""
@@ -86,54 +86,63 @@ class Painting:
 
 def painted(frame: Bits, sensor: SensorMap) -> NDArray[np.uint8]:
     """The ideal frame, uint8 of {0, 1}, of one frame (height, width) of the sensor, for a map that is this frame's own."""
-    window = sensor_window(sensor)
-    rows, columns = np.nonzero(frame[window])
+    view = View.of(sensor)
+    rows, columns = np.nonzero(frame[view.window])
     canvas = np.zeros(sensor.ideal.height * sensor.ideal.width + 1, dtype=np.uint8)
-    canvas[:-1] = ~shown_whole(sensor).ravel()
+    canvas[:-1] = ~view.shown.ravel()
     if len(rows):
-        table, everything = what_pixels_show(sensor, rows + window[0].start, columns + window[1].start)
+        table, everything = what_pixels_show(sensor, rows + view.window[0].start, columns + view.window[1].start)
         canvas[table] = 1
         if everything.any():
             canvas[:] = 1
     return canvas[:-1].reshape(sensor.ideal.shape)
 
 
-def sensor_window(sensor: SensorMap) -> tuple[slice, slice]:
-    """Rows and columns of the sensor outside which nothing of the ideal frame is shown."""
-    tops, lefts = (np.arange(0, side, BLOCK_PX, dtype=np.float64) for side in sensor.ideal.shape)
+@dataclass(frozen=True)
+class View:
+    """What the sensor shows of the ideal frame: `window`, the rows and columns of the sensor outside which it shows nothing of it, and
+    `shown`, the ideal pixels, (height, width), that it shows as a whole, whatever the rotation and calibration.
+    """
+
+    window: tuple[slice, slice]
+    shown: Bits
+
+    @staticmethod
+    def of(sensor: SensorMap) -> View:
+        """Of blocks of the ideal frame, and of the pixels of those that the sensor's border may cut."""
+        height, width = sensor.ideal.shape
+        tops, lefts = np.arange(0, height, BLOCK_PX), np.arange(0, width, BLOCK_PX)
+        column, row = _shown_squares(sensor, tops[:, None], lefts[None, :], BLOCK_PX)
+        window = _within(row, sensor.camera.height), _within(column, sensor.camera.width)
+        inside = _inside(sensor, column, row)
+        shown = inside.repeat(BLOCK_PX, axis=0).repeat(BLOCK_PX, axis=1)[:height, :width]
+        out = (column[1] <= 0) | (column[0] >= sensor.camera.width) | (row[1] <= 0) | (row[0] >= sensor.camera.height)
+        unsure = np.nonzero(~inside & ~out)
+        if len(unsure[0]):
+            offsets = np.arange(BLOCK_PX)
+            rows, columns = tops[unsure[0], None, None] + offsets[:, None], lefts[unsure[1], None, None] + offsets
+            rows, columns = (side.ravel() for side in np.broadcast_arrays(rows, columns))
+            kept = (rows < height) & (columns < width)
+            rows, columns = rows[kept], columns[kept]
+            shown[rows, columns] = _inside(sensor, *_shown_squares(sensor, rows, columns, 1))
+        return View(window, shown)
+
+
+def _shown_squares(sensor: SensorMap, rows: Integers, columns: Integers, size: int) -> tuple[Interval, Interval]:
+    """(column, row) of the sensor that squares of the ideal frame, cut off at its border, are shown in."""
     height, width = sensor.ideal.shape
-    u, v = np.meshgrid(lefts, tops)
-    column, row = sensor.to_sensor((u, np.minimum(u + BLOCK_PX, width)), (v, np.minimum(v + BLOCK_PX, height)))
-    return _within(row, sensor.camera.height), _within(column, sensor.camera.width)
+    u, v = (side.astype(np.float64) for side in np.broadcast_arrays(columns, rows))
+    return sensor.to_sensor((u, np.minimum(u + size, width)), (v, np.minimum(v + size, height)))
+
+
+def _inside(sensor: SensorMap, column: Interval, row: Interval) -> Bits:
+    """True for what lies within the sensor's frame."""
+    return (column[0] >= 0) & (column[1] <= sensor.camera.width) & (row[0] >= 0) & (row[1] <= sensor.camera.height)
 
 
 def _within(side: Interval, size: int) -> slice:
     low, high = np.clip([side[0].min(), side[1].max()], 0, size)
     return slice(math.floor(low), math.ceil(high))
-
-
-def shown_whole(sensor: SensorMap) -> Bits:
-    """The pixels of the ideal frame, (height, width), that the sensor shows as a whole, whatever the rotation and calibration."""
-    height, width = sensor.ideal.shape
-    shown = np.ones((height, width), dtype=bool)
-    tops, lefts = np.arange(0, height, BLOCK_PX), np.arange(0, width, BLOCK_PX)
-    rows, columns = (side.ravel() for side in np.meshgrid(tops, lefts, indexing="ij"))
-    unsure = ~_inside(sensor, rows, columns, BLOCK_PX)
-    if unsure.any():
-        offsets = np.arange(BLOCK_PX)
-        rows = np.broadcast_to((rows[unsure, None, None] + offsets[:, None]), (unsure.sum(), BLOCK_PX, BLOCK_PX)).ravel()
-        columns = np.broadcast_to((columns[unsure, None, None] + offsets), (unsure.sum(), BLOCK_PX, BLOCK_PX)).ravel()
-        kept = (rows < height) & (columns < width)
-        rows, columns = rows[kept], columns[kept]
-        shown[rows, columns] = _inside(sensor, rows, columns, 1)
-    return shown
-
-
-def _inside(sensor: SensorMap, rows: Integers, columns: Integers, size: int) -> Bits:
-    """True for squares of the ideal frame that lie within the sensor's frame."""
-    u, v = columns.astype(np.float64), rows.astype(np.float64)
-    column, row = sensor.to_sensor((u, u + size), (v, v + size))
-    return (column[0] >= 0) & (column[1] <= sensor.camera.width) & (row[0] >= 0) & (row[1] <= sensor.camera.height)
 
 
 def what_pixels_show(sensor: SensorMap, rows: Integers, columns: Integers) -> tuple[NDArray[np.int32], Bits]:
@@ -142,8 +151,7 @@ def what_pixels_show(sensor: SensorMap, rows: Integers, columns: Integers) -> tu
     Ideal pixels of the box around the quadrilateral are left out where one of its edges, moved outward, has them on its other side.
     """
     height, width = sensor.ideal.shape
-    corners = [sensor.corners(rows + down, columns + right) for down, right in CORNERS]
-    u, v = (tuple(np.stack([corner[axis][side] for corner in corners]) for side in (0, 1)) for axis in (0, 1))
+    u, v = sensor.corners(rows + DOWN, columns + RIGHT)
     seen = np.isfinite(u[1]).all(axis=0) & np.isfinite(v[1]).all(axis=0)
     u, v = ((np.where(seen, side[0], 0.0), np.where(seen, side[1], 0.0)) for side in (u, v))
     bow = sensor.bow_px
@@ -155,29 +163,30 @@ def what_pixels_show(sensor: SensorMap, rows: Integers, columns: Integers) -> tu
     none = everything | out
     right, bottom = np.where(none, left, right), np.where(none, top, bottom)
     limits = _limits((u[0] - left, u[1] - left), (v[0] - top, v[1] - top), bow)
-    table = []
-    for down in range(int((bottom - top).max(initial=0)) + 1):
-        for aside in range(int((right - left).max(initial=0)) + 1):
-            row, column = top + down, left + aside
-            met = ~none & (row <= bottom) & (column <= right) & (row >= 0) & (row < height) & (column >= 0) & (column < width)
-            for across, along, limit in limits:
-                met &= across * aside + along * down + np.minimum(across, 0) + np.minimum(along, 0) <= limit
-            table.append(np.where(met, row * width + column, height * width))
-    ordered = np.sort(np.stack(table, axis=1).astype(np.int32), axis=1)
-    most = int((ordered < height * width).sum(axis=1).max(initial=1))
-    return ordered[:, : max(most, 1)], everything
+    down, aside = (
+        side.reshape(-1, 1) for side in np.mgrid[: int((bottom - top).max(initial=0)) + 1, : int((right - left).max(initial=0)) + 1]
+    )
+    row, column = top + down, left + aside
+    met = (row <= bottom) & (column <= right) & (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    for across, along, limit in limits:
+        met &= across * aside + along * down <= limit
+    ordered = np.sort(np.where(met & ~none, row * width + column, height * width).astype(np.int32), axis=0)
+    most = int((ordered < height * width).sum(axis=0).max(initial=1))
+    return ordered[: max(most, 1)].T, everything
 
 
 def _limits(u: Interval, v: Interval, bow: float) -> list[tuple[Floats, Floats, Floats]]:
-    """For each edge a normal (across, along), and what its product with a point of what the pixel shows is at most."""
+    """For each edge its outward normal (across, along), and what its product with the near corner of a pixel that is met is at most."""
     middle_u, middle_v = (u[0] + u[1]) / 2, (v[0] + v[1]) / 2
     half_u, half_v = (u[1] - u[0]) / 2, (v[1] - v[0]) / 2
     limits = []
-    for corner in range(len(CORNERS)):
-        following = (corner + 1) % len(CORNERS)
+    for corner in range(len(DOWN)):
+        following = (corner + 1) % len(DOWN)
         across, along = middle_v[following] - middle_v[corner], middle_u[corner] - middle_u[following]
-        reach = across * middle_u + along * middle_v + np.abs(across) * half_u + np.abs(along) * half_v
-        limits.append((across, along, reach.max(axis=0) + (bow + OUTWARD_PX) * (np.abs(across) + np.abs(along))))
+        size_across, size_along = np.abs(across), np.abs(along)
+        reach = (across * middle_u + along * middle_v + size_across * half_u + size_along * half_v).max(axis=0)
+        nearest = np.minimum(across, 0) + np.minimum(along, 0)
+        limits.append((across, along, reach + (bow + OUTWARD_PX) * (size_across + size_along) - nearest))
     return limits
 
 
@@ -202,13 +211,9 @@ def ideal_pixels_a_pixel(scene: Scene, sensor: SensorMap, painting: Painting) ->
 
 def _extents(sensor: SensorMap, rows: Integers, columns: Integers) -> tuple[Floats, Floats]:
     """Width and height, px of the ideal frame, of what pixels show."""
-    corners = [sensor.corners(rows + down, columns + right) for down, right in CORNERS]
-    sides = []
-    for axis in (0, 1):
-        low = np.minimum.reduce([corner[axis][0] for corner in corners])
-        high = np.maximum.reduce([corner[axis][1] for corner in corners])
-        sides.append(high - low + 2 * (sensor.bow_px + OUTWARD_PX))
-    return sides[0], sides[1]
+    u, v = sensor.corners(rows + DOWN, columns + RIGHT)
+    wide, tall = ((high.max(axis=0) - low.min(axis=0)) + 2 * (sensor.bow_px + OUTWARD_PX) for low, high in (u, v))
+    return wide, tall
 
 
 def _flattest(scene: Scene, sensor: SensorMap) -> float:

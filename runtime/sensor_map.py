@@ -37,6 +37,8 @@ Angle = tuple[float, float]
 
 BEYOND_RUNWAY_PX = 4
 """Columns and rows of the ideal frame on every side of what the runway can reach."""
+LARGEST_ANGLE_RAD, EDGES_BEYOND = 1.4, 1.25
+"""Rays farther off the axis are not told apart, and how far beyond those that are needed an edge is looked for that begins within them."""
 LEAST_DEPTH = 2.0**-8
 """A ray whose depth in the other frame is not certainly above this, per unit of its own, counts as not seen there."""
 
@@ -53,6 +55,11 @@ class Turn:
     def of(a: Angle, b: Angle) -> Turn:
         """From the least and the largest angles. Raises ValueError where one is inverted or beyond a quarter turn."""
         return Turn(*(_middle(name, angle) for name, angle in (("a", a), ("b", b))))
+
+    @property
+    def largest_rad(self) -> float:
+        """By how much it turns the axis at most: only R_y(b) does."""
+        return math.atan2(abs(self.b[1]), self.b[0]) + self.b[2] + ROUNDING_SHARE
 
 
 def _middle(name: str, angle: Angle) -> tuple[float, float, float]:
@@ -133,16 +140,21 @@ class SensorMap:
         """Bound, in px of the ideal frame, on how far the image of a pixel's edge lies from the segment between its corners' images.
 
         A lens bends an edge of length h by h^2/8 of its curvature, and a rotation, which keeps lines straight, magnifies that by 1 + M^2
-        at most where the ideal frame shows M.
+        at most where the ideal frame shows M. The curvature is that of the rays which the ideal frame can show, and of an edge beyond.
         """
-        if self.lens.curvature == 0:
+        if self.lens.model is None:
             return 0.0
         camera, ideal = self.camera, self.ideal
         edge = 1 / (min(camera.focal_u_px, camera.focal_v_px) * (1 - self.calibration.focal_relative))
         across = max(abs(ideal.u0), abs(ideal.width - ideal.u0)) / ideal.focal_u_px
         down = max(abs(ideal.v0), abs(ideal.height - ideal.v0)) / ideal.focal_v_px
         magnified = 1.0 if self.turn is None else 1 + across**2 + down**2 + 2.0**-4
-        return max(ideal.focal_u_px, ideal.focal_v_px) * edge**2 / 8 * self.lens.curvature * magnified * (1 + ROUNDING_SHARE)
+        angle = math.atan(math.hypot(across, down)) + (0.0 if self.turn is None else self.turn.largest_rad)
+        needed = math.tan(angle) if angle < LARGEST_ANGLE_RAD else self.lens.radius
+        beyond = EDGES_BEYOND * needed
+        if needed + 2 * edge / self.lens.stretch_within(beyond) > beyond:
+            beyond = self.lens.radius
+        return max(ideal.focal_u_px, ideal.focal_v_px) * edge**2 / 8 * self.lens.curvature_within(beyond) * magnified * (1 + ROUNDING_SHARE)
 
     def project(self, points: Floats, a: float = 0.0, b: float = 0.0) -> Floats:
         """Where the sensor shows points (..., 2), (u, v) px, of the ideal frame at one rotation: (..., 2), (column, row) px.

@@ -402,6 +402,8 @@ def main(
     errors = terminal.console(stderr=True)
     try:
         estimator = Estimator.load(model)
+        if not estimator.scene.camera.pinhole:
+            raise ValueError(f"{model}: its camera has a lens, which the set inversion does not know; give a model of a pinhole")
         inversion = SetInversion(estimator.scene)
     except (ModelError, ValueError) as error:
         fail(error)

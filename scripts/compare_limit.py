@@ -72,6 +72,8 @@ def loaded(path: Path, missed_budget: int) -> Estimator:
 
 def _checked(estimator: Estimator) -> Estimator:
     tolerance = estimator.scene.tolerance.line_px
+    if not estimator.scene.camera.pinhole:
+        raise ValueError("camera.distortion: found a lens, of which the limit is not sampled; give a model of a pinhole")
     if tolerance:
         raise ValueError(f"tolerance.line_px: found {tolerance}, expected 0; give a model whose frames are exact")
     return estimator

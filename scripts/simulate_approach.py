@@ -42,7 +42,8 @@ from rich.table import Table
 from runtime import Scene, SceneError, terminal
 from runtime.errors import fail
 from runtime.recordings.recording import EVENT
-from runtime.scene import STATE_NAMES, STATE_UNITS, Calibration
+from runtime.scene import STATE_NAMES, STATE_UNITS, Calibration, Camera
+from runtime.sensor_map import lens_of
 from runtime.whole_file import OutputError, replacing, write_whole, writing
 
 WINDOW_US = 40_000
@@ -267,6 +268,20 @@ def _smooth_field(blur_texels: float, rng: np.random.Generator) -> Floats:
     return np.fft.irfft2(noise * np.outer(*decay), s=(TEXTURE_TEXELS, TEXTURE_TEXELS))
 
 
+def pinhole_points(camera: Camera, u: Floats, v: Floats) -> tuple[Floats, Floats]:
+    """Where a pinhole of the camera's focal lengths and principal point would show what the sensor shows at these points, px."""
+    if camera.pinhole:
+        return u, v
+    x, y, _ = lens_of(camera, Calibration()).undistorted((u - camera.u0) / camera.focal_u_px, (v - camera.v0) / camera.focal_v_px)
+    return camera.u0 + camera.focal_u_px * x, camera.v0 + camera.focal_v_px * y
+
+
+def largest_stretch(camera: Camera) -> float:
+    """By how much a lens enlarges what a pinhole shows, at most; 1 without one."""
+    bounds = lens_of(camera, Calibration()).bounds
+    return 1.0 if camera.pinhole else max(1.0, float(max(bounds.across[1].max(), bounds.along[1].max())))
+
+
 class EventCamera:
     """The sensor over the ground: `blocks` gives the flight's events in order of time, at most 80 ms at once."""
 
@@ -274,7 +289,7 @@ class EventCamera:
         self.flight, self.ground, self.sensor, self.rng = flight, ground, sensor, rng
         height, width = flight.scene.camera.shape
         rows, columns = np.mgrid[:height, :width]
-        self._u, self._v = columns.ravel() + 0.5, rows.ravel() + 0.5
+        self._u, self._v = pinhole_points(flight.scene.camera, columns.ravel() + 0.5, rows.ravel() + 0.5)
         pixels = height * width
         spread = rng.normal(sensor.contrast_threshold, sensor.threshold_spread, pixels)
         self._threshold = np.maximum(spread, sensor.contrast_threshold / 2).astype(np.float32)
@@ -331,7 +346,7 @@ class EventCamera:
         camera = self.flight.scene.camera
         grid = np.array([[u, v, 1.0] for u in (0, camera.u0, camera.width) for v in (camera.v0, camera.height)]).T
         moved = np.linalg.inv(maps) @ (maps[len(maps) // 2] @ grid)
-        motion = np.abs(moved[:, :2] / moved[:, 2:] - grid[:2]).max()
+        motion = np.abs(moved[:, :2] / moved[:, 2:] - grid[:2]).max() * largest_stretch(camera)
         if motion > LARGEST_MOTION_PX:
             raise ValueError(f"vibration: the image moves by {motion:.1f} px in {BLOCK_US // 1000} ms; keep it to {LARGEST_MOTION_PX}")
         return max(1, math.ceil(motion))

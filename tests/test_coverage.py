@@ -25,7 +25,7 @@ import typer
 from coverage import campaign, frames, states
 from coverage.chunk import code
 from coverage.judge import Tally, extra_pixels, judge_frame, quantile
-from coverage.models import DERIVED
+from coverage.models import DERIVED, LENSES, derived_scene
 from coverage.scenarios import Scenario, camera_off, scenarios
 from coverage.states import Rng, Stage
 from rational_image import RationalState, RationalView, angle_is_at_least, lit_columns, turn
@@ -34,6 +34,7 @@ from runtime.camera import project
 from runtime.image import runway_image
 from runtime.model.format import METADATA_KEY, metadata_digest
 from runtime.scene import Scene
+from runtime.sensor_image import sensor_curves
 
 SPREAD = (PAPER, FREE_X, UNLIKE_MARKINGS, CUT_LEFT, CUT_BELOW)
 
@@ -76,6 +77,21 @@ def test_on_borders_the_images_are_the_exact_twins_and_the_runtimes_but_for_ties
         assert (image == twin_image(PAPER, segments).astype(bool)).all()
         ties += near_ties(segments, runway_image(PAPER, state.floats), image.astype(np.uint8))
     assert ties > 0
+
+
+@pytest.mark.parametrize("lens", LENSES)
+def test_curves_behind_a_lens_are_the_runtimes(lens: str, rng: Rng) -> None:
+    """All pixels of points close together along each curve, and none that the runtime's outward image has not."""
+    scene = derived_scene(PAPER, lens)
+    view = RationalView.of(scene.to_dict())
+    for _ in range(3):
+        state = RationalState.near(rng.uniform(scene.domain.lower, scene.domain.upper))
+        image, outward = view.image(state).frame, runway_image(scene, state.floats) != 0
+        assert not (image & ~outward).any()
+        assert (outward & ~image).sum() <= 4 < image.sum()
+        points = sensor_curves(scene, state.floats, points=20_001)
+        columns, rows = np.floor(points[((points >= 0) & (points < [640, 480])).all(axis=-1)]).astype(int).T
+        assert image[rows, columns].all()
 
 
 @pytest.mark.parametrize(("start", "stop", "lit"), DRAWN)

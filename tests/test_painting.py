@@ -18,8 +18,8 @@ from test_sensor_map import OFF, precise_sensor, seen_through, turns
 
 from runtime.camera import project
 from runtime.image import runway_image
-from runtime.painting import Painting, ideal_pixels_a_pixel, painted, shown_whole, what_pixels_show
-from runtime.scene import Calibration, Scene, SceneError
+from runtime.painting import Painting, View, ideal_pixels_a_pixel, painted, what_pixels_show
+from runtime.scene import Calibration, Camera, Distortion, Scene, SceneError
 from runtime.sensor import Sensor
 from runtime.sensor_map import SensorMap
 
@@ -90,7 +90,7 @@ def test_no_pixel_of_the_runway_is_lost(
             frame[row, column] = True
             met.append(point)
         else:
-            assert not shown_whole(sensor)[int(point[1]), int(point[0])]
+            assert not View.of(sensor).shown[int(point[1]), int(point[0])]
     canvas = painted(frame, sensor)
     for u, v in points:
         assert canvas[int(v), int(u)], (u, v)
@@ -179,12 +179,26 @@ def test_only_the_border_of_what_the_sensor_shows_is_taken_for_lit(name: str) ->
     """An ideal pixel counts as not shown only if the sensor shows a point out of its frame within a few pixels of it."""
     sensor = SENSORS[name].map
     assert sensor is not None
-    shown = shown_whole(sensor)
+    shown = View.of(sensor).shown
     rows, columns = np.nonzero(~shown)
     points = np.stack([columns + 0.5, rows + 0.5], axis=-1)
     near = np.stack([sensor.project(points + offset) for offset in [(a, b) for a in (-2, 0, 2) for b in (-2, 0, 2)]])
     out = ((near < 0) | (near > [sensor.camera.width, sensor.camera.height])).any(axis=2).any(axis=0)
     assert out.all()
+
+
+def test_a_fisheye_of_more_than_a_half_space_paints_no_more() -> None:
+    """Its frame's corners show what lies behind the camera; of the ideal frame, near the axis, pixels paint about four as ever."""
+    camera = Camera(640, 480, focal_px=(200.0, 200.0), distortion=Distortion("fisheye", (0.0, 0.0, 0.0, 0.0)))
+    sensor = Sensor.of(replace(PAPER, camera=camera))
+    assert sensor.painting is not None
+    assert not sensor.painting.unseen.any()
+    assert not sensor.painting.everything.any()
+    assert sensor.pixels_a_pixel <= 5
+    for state in np.random.default_rng(6).uniform(PAPER.domain.lower, PAPER.domain.upper, (5, 4)):
+        canvas = sensor.painted(runway_image(sensor.scene, state))
+        assert not (runway_image(sensor.ideal, state) > canvas).any()
+        assert canvas.sum() < 8 * runway_image(sensor.scene, state).sum()
 
 
 # --- the sensor ---

@@ -17,7 +17,9 @@ import derive_field
 import simulate_approach as simulator
 from attitude_reference import attitude_text
 from rich.console import Console
-from scenes import AIRPORT
+from scenes import AIRPORT, PAPER
+from test_lens import WIDE
+from test_sensor_map import seen_through
 
 from build_model.calibration import check_calibration
 from build_model.window import Window
@@ -28,6 +30,7 @@ from runtime.image import dilated, runway_image
 from runtime.recordings.attitude import AttitudeReadings
 from runtime.recordings.recording import read_events
 from runtime.scene import Calibration, Domain, Scene, Tolerance
+from runtime.sensor_map import SensorMap
 
 STEADY = simulator.Vibration(yaw_rad=0.0, roll_rad=0.0, pitch_rad=0.0)
 EXACT_TIMES = simulator.Sensor(noise_rate_hz=0.0, latency_us=0.0, latency_jitter_us=0.0)
@@ -281,3 +284,16 @@ def test_the_attitude_references_plus_minus_holds_and_is_used(paper_scene, tmp_p
         off.append(error.mean())
     assert np.abs(off).max() > 0.7 * plus_minus
     assert np.std(off) > 0.3 * plus_minus
+
+
+def test_a_lens_bends_what_the_sensor_sees() -> None:
+    """A pixel of the sensor looks where the pinhole's pixel does that the lens shows there."""
+    scene = seen_through(PAPER, WIDE)
+    sensor = SensorMap.of(scene)
+    points = np.random.default_rng(3).uniform([0, 0], [sensor.ideal.width, sensor.ideal.height], (200, 2))
+    seen = np.stack(simulator.pinhole_points(scene.camera, *sensor.project(points).T), axis=-1)
+    shift = [scene.camera.u0 - sensor.ideal.u0, scene.camera.v0 - sensor.ideal.v0]
+    assert np.abs(seen - shift - points).max() < 1e-6
+    u, v = np.array([3.5]), np.array([7.5])
+    assert simulator.pinhole_points(PAPER.camera, u, v) == (u, v)
+    assert simulator.largest_stretch(PAPER.camera) == 1

@@ -92,8 +92,7 @@ def verify_model(path: str | Path, jobs: int = 1, progress: Progress = _silent) 
     try:
         cells = len(cell_boxes(scene))
         ideal = _ideal_of(scene, metadata)
-        demand(metadata.get("assumptions") == assumptions(scene), "metadata: the assumptions are not the scene's")
-        tables, shift_px = _check_all_but_masks(model, metadata, ideal)
+        tables, shift_px = _check_all_but_masks(model, metadata, ideal, assumptions(scene))
         for proof in _cell_proofs(ideal, tables, jobs):
             if isinstance(proof, Counterexample):
                 raise Refuted(proof)
@@ -176,7 +175,7 @@ def cell_boxes(scene: Scene) -> Partition:
     return Partition(lower=boxes[:, :, 0], upper=boxes[:, :, 1])
 
 
-def _check_all_but_masks(model: onnx.ModelProto, metadata: dict[str, Any], scene: Scene) -> tuple[FilterTables, float]:
+def _check_all_but_masks(model: onnx.ModelProto, metadata: dict[str, Any], scene: Scene, assumed: list[str]) -> tuple[FilterTables, float]:
     """Graph, metadata, cells' and padding's boxes, calibration. Returns the tables and the displacement, px. Raises `Refuted`."""
     cells = cell_boxes(scene)
     tables = read_tables(model.graph, cells)
@@ -184,6 +183,7 @@ def _check_all_but_masks(model: onnx.ModelProto, metadata: dict[str, Any], scene
     least = tables.smallest_must_light
     demand(metadata.get("smallest_must_light") == least, f"metadata: smallest_must_light is not {least}, the least |K| of the file")
     demand(least > scene.tolerance.missed_budget, f"the least |K|, {least}, does not exceed the missed budget")
+    demand(metadata.get("assumptions") == assumed, "metadata: the assumptions are not the scene's")
     _check_whole_cells(model, cells, tables)
     check_boxes(scene, tables)
     shift_px = displacement_px(scene, tables.window)

@@ -160,7 +160,7 @@ def main(
     output.parent.mkdir(parents=True, exist_ok=True)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     given = Estimator.load(model)
-    chosen = list(scenarios(recording is not None, given.metadata["smallest_must_light"] - 1))
+    chosen = list(scenarios(recording is not None, given.largest_missed_budget))
     if replay_frame is not None:
         scenario, number = named(replay_frame, chosen)
         path = model if scenario.model == "given" else build_model(given.scene, scenario.model, output.parent, jobs)

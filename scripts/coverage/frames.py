@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rational_image import Frame, RationalState, RationalView
 
 from build_model.hough_bank import CellBank, cell_bank
-from coverage.states import Rng, Stage, image_of, into_domain, spatial_mask
+from coverage.states import Rng, Stage, estimator_of, image_of, into_domain, spatial_mask
 from runtime.frames import events_to_frames
 from runtime.recordings.recording import read_events
 
@@ -32,9 +32,8 @@ def recorded_frames(path: str, shape: tuple[int, int]) -> NDArray[np.bool_]:
 @functools.cache
 def bank_of(path: str, cell: int) -> CellBank:
     """The bank of one cell, built anew: its K say which pixels hurt most."""
-    scene = Stage.of(path, None).scene
-    cells = Stage.of(path, None).cells
-    return cell_bank(scene, cells.lower[cell], cells.upper[cell])
+    sensor, cells = estimator_of(path).sensor, Stage.of(path, None).cells
+    return cell_bank(sensor.ideal, cells.lower[cell], cells.upper[cell], sensor.unseen)
 
 
 @dataclass
@@ -125,22 +124,24 @@ def must_light(rng: Rng, picture: Picture) -> Pixels:
     stage, state = picture.stage, picture.states[0]
     bank = bank_of(stage.path, int(rng.choice(stage.cells_of(state))))
     theta, x, y, z = state.floats
-    tangent = (bank.lines.reference_row - stage.scene.camera.v0) / stage.scene.camera.focal_v_px
-    scale = stage.scene.camera.focal_u_px * (np.cos(theta) * tangent + np.sin(theta)) / y
+    sensor = estimator_of(stage.path).sensor
+    camera = sensor.ideal.camera
+    tangent = (bank.lines.reference_row - camera.v0) / camera.focal_v_px
+    scale = camera.focal_u_px * (np.cos(theta) * tangent + np.sin(theta)) / y
     line = np.stack([np.full_like(scale, theta), np.full_like(scale, x), scale, np.full_like(scale, z)], axis=-1)
     holding = np.flatnonzero(((bank.lines.lower - 1e-9 <= line) & (line <= bank.lines.upper + 1e-9)).all(axis=1))
-    must, runs = np.zeros_like(picture.runway), bank.must_light
+    must, runs = np.zeros(camera.shape, dtype=np.bool_), bank.must_light
     for run in np.flatnonzero(runs.mask == rng.choice(holding)) if len(holding) else ():
         must[runs.start[run] : runs.stop[run], runs.column[run]] = True
     lit = image_of(picture.camera, state)
-    return rng.permutation(lit.flat[must[lit.rows, lit.columns]])
+    return rng.permutation(lit.flat[sensor.seen_in(must)[lit.rows, lit.columns]])
 
 
 def put_out(picture: Picture, order: Pixels, missed: int) -> None:
     """Darkens pixels in the given order, as many as leave no more than `missed` pixels of the true image without a witness."""
     if missed == 0:
         return
-    stage, ideal = picture.stage, image_of(picture.stage.view, picture.states[0])
+    stage, ideal = picture.stage, image_of(picture.stage.counted(picture.camera), picture.states[0])
 
     def put_out_first(count: int) -> Frame:
         frame = picture.frame.copy()

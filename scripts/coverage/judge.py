@@ -114,7 +114,7 @@ def judged_states(picture: Picture, missed: int, extra: int, runway: bool) -> li
     for state in picture.states if runway else ():
         if not stage.contains(state):
             continue
-        image, seen = image_of(stage.view, state), image_of(picture.camera, state).frame
+        image, seen = image_of(stage.counted(picture.camera), state), image_of(picture.camera, state).frame
         if stage.unwitnessed(image, picture.frame) <= missed and (extra < 0 or extra_pixels(picture, state) <= extra):
             judged.append(Judged(state, seen & picture.frame))
     return judged

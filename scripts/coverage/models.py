@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from rational_image import RationalState, RationalView
 
-from build_model.export import export_model
+from build_model.export import NO_ESTIMATOR, export_model
 from build_model.partition import partition
 from runtime import Scene
-from runtime.scene import Axis, Calibration, EstimatorTraining, Runway, Tolerance
+from runtime.scene import Axis, Calibration, Camera, Distortion, EstimatorTraining, Runway, Tolerance
 
 OFF_BY = Calibration(roll_rad=0.001, yaw_rad=0.0005, focal_relative=0.001, principal_px=0.2)
 SHIFTED = Calibration(principal_px=0.99)
@@ -25,7 +25,16 @@ SMALL_CELL = 8
 """How many times smaller a cell is in which a whole marking stays out of view."""
 SIDES = ("left", "top", "bottom")
 BARELY = ("barely above", "barely below")
-DERIVED = ("tolerant", *(f"cut {side}{also}" for side in SIDES for also in ("", ", tolerant")), *BARELY)
+LENSES = {
+    "barrel lens": Distortion("radial-tangential", (-0.4, 0.17, 0.0, 0.0)),
+    "wide lens": Distortion("radial-tangential", (-0.28, 0.07, 0.001, -0.002, 0.003)),
+    "pincushion lens": Distortion("radial-tangential", (0.2, 0.0, -0.001, 0.001)),
+    "fisheye lens": Distortion("fisheye", (-0.013, 0.05, -0.045, 0.012)),
+    "wide lens, off": Distortion("radial-tangential", (-0.28, 0.07, 0.001, -0.002, 0.003)),
+}
+"""Lenses before which the scene's camera is put, its pixels oblong and its principal point off by a tenth; the last one's camera is off."""
+THROUGH_A_LENS_OFF = Calibration(roll_rad=0.0005, yaw_rad=0.0005, focal_relative=0.0005, principal_px=0.3)
+DERIVED = ("tolerant", *(f"cut {side}{also}" for side in SIDES for also in ("", ", tolerant")), *BARELY, *LENSES)
 """Names of the models that are built."""
 UNTRAINED = EstimatorTraining(training_frames=256, epochs=1)
 """NN_e is not certified: one epoch gives it a shape."""
@@ -36,15 +45,33 @@ def derived_scene(scene: Scene, name: str) -> Scene:
     exact = replace(scene, estimator=UNTRAINED, calibration=Calibration(), tolerance=Tolerance())
     if name == "tolerant":
         return replace(exact, calibration=OFF_BY, tolerance=Tolerance(line_px=1))
+    if name in LENSES:
+        return seen_through(exact, name)
     side, _, also = name.removeprefix("cut ").partition(", ")
     cut = staggered_scene(exact, above=name == BARELY[0]) if name in BARELY else cut_scene(exact, side)
     return replace(cut, calibration=SHIFTED, tolerance=Tolerance(line_px=1)) if also or name in BARELY else cut
 
 
+def seen_through(scene: Scene, name: str) -> Scene:
+    """Up to two cells an axis, behind one of `LENSES`."""
+    camera = scene.camera
+    axes = [few_cells(axis, first=number % 2 == 0) for number, axis in enumerate(scene.domain.axes)]
+    scene = replace(scene, domain=replace(scene.domain, theta_rad=axes[0], x_m=axes[1], y_m=axes[2], z_m=axes[3]))
+    off = THROUGH_A_LENS_OFF if name.endswith("off") else Calibration()
+    behind = Camera(
+        camera.width,
+        camera.height,
+        principal_point=(camera.u0 + camera.width / 10, camera.v0 - camera.height / 20),
+        focal_px=(camera.focal_u_px * 1.03, camera.focal_v_px * 0.98),
+        distortion=LENSES[name],
+    )
+    return replace(scene, camera=behind, calibration=off)
+
+
 def build_model(scene: Scene, name: str, folder: Path, jobs: int) -> Path:
     """Writes one of `DERIVED` to `folder` and returns its path. The same scene and versions give the same file."""
     path = folder / f"coverage-{name.replace(', ', '-').replace(' ', '-')}.onnx"
-    export_model(derived_scene(scene, name), path, jobs=jobs)
+    export_model(derived_scene(scene, name), path, jobs=jobs, estimator=NO_ESTIMATOR if name in LENSES else None)
     return path
 
 

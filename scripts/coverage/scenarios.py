@@ -139,6 +139,13 @@ def scenarios(recording: bool, largest_missed: int) -> Iterator[Scenario]:
     yield Scenario("camera off, missed in neighbouring rows", (few,), model="tolerant", missed=m, order=row_band)
     yield Scenario("camera off, a second runway", (near, few), model="tolerant")
     yield Scenario("camera off, B: e pixels in S", (few,), model="tolerant", extra=(0, 1, 3, 8))
+    for lens in ("barrel", "wide", "pincushion", "fisheye"):
+        yield Scenario(f"a {lens} lens", (few,), model=f"{lens} lens", missed=(0, 0, 1, 2))
+        yield Scenario(f"a {lens} lens, on faces, clutter 0-100%", (every,), on_faces, f"{lens} lens")
+    yield Scenario("a wide lens, missed at one end, a second runway", (near, few), model="wide lens", missed=(1, 2), order=one_end)
+    yield Scenario("a wide lens, all lit but the missed", (everything,), model="wide lens", missed=(0, 1, 2), order=must_light)
+    yield Scenario("a wide lens, camera off", (few,), model="wide lens, off", missed=(0, 0, 1))
+    yield Scenario("a wide lens, camera off, on faces", (few,), on_faces, "wide lens, off")
     for side in ("left", "top", "bottom"):
         yield Scenario(f"cut by the {side} border", (few,), cut_by_the_frame, f"cut {side}")
         yield Scenario(f"cut by the {side} border, camera off", (few,), cut_by_the_frame, f"cut {side}, tolerant")

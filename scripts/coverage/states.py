@@ -60,6 +60,10 @@ class Stage:
         """Largest state of the domain, (4,)."""
         return self.scene.domain.upper
 
+    def counted(self, camera: RationalView) -> RationalView:
+        """The camera whose image a frame must not lack: the scene's own, up to the tolerance; behind a lens the one that took the frame."""
+        return self.view if camera.lens is None else camera
+
     def cells_of(self, state: RationalState) -> list[int]:
         """Numbers of the cells that hold a state, borders included."""
         cells, floats = self.cells, state.floats
