@@ -111,7 +111,8 @@ def run_model(
         complain(f"{recording}: {line}")
     if fault:
         fail(f"{fault}; {summary['windows']} windows are written to {folder}", code)
-    if truth is not None and known is not None and "assumptions_hold" not in summary:
+    level = estimator.attitude is None and (follower is None or not follower.turned)
+    if truth is not None and known is not None and level and "assumptions_hold" not in summary:
         fail(_unmatched(truth, known, summary))
 
 
@@ -177,7 +178,7 @@ def _estimate_all(
         estimate = report.estimator.estimate(frame, refine=refine, attitude=attitude)
         milliseconds = 1000 * (time.perf_counter() - begun)
         tracked = None if follower is None else follower.update(frame, start_us + report.instant_us)
-        report.add(start_us, frame, estimate, milliseconds, tracked)
+        report.add(start_us, frame, estimate, milliseconds, tracked, level=attitude is None and report.estimator.attitude is None)
         if bar is not None and task is not None:
             seconds += stream.step_us / 1e6
             bar.update(task, advance=1, seconds=seconds)
