@@ -16,7 +16,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ from build_model.pixel_mask import VerticalRuns, inset, paint, runs_of, widened
 from build_model.spatial_filter import reference_row, sliced, spatial_filter
 from build_model.window import Bits, Window
 from runtime.model.limits import SCALE_STEP, SMALLEST_LEVER_M
+from runtime.refine.refiner import joined
 from runtime.rounding import float32_above, float32_below, inverted
 from runtime.scene import STATE_NAMES, Bank, Scene, SceneError
 from runtime.state_set import StateSet, contract, scale_range, tangent_of_row
@@ -177,7 +178,7 @@ class Entries:
         sizes, states = [len(part) for part in parts], [part.states for part in parts]
         return Entries(
             LineBoxes.joined([part.lines for part in parts]),
-            StateSet(*(np.concatenate([getattr(sets, field.name) for sets in states]) for field in fields(StateSet))),
+            joined(*states),
             VerticalRuns.joined([part.must_light for part in parts], sizes),
             VerticalRuns.joined([part.may_light for part in parts], sizes),
         )

@@ -7,6 +7,7 @@ Conventions: `runtime.camera`. What is guaranteed: `runtime.estimator` and docs/
 """
 
 from runtime import offline  # noqa: F401  first
+from runtime.attitude import Attitude
 from runtime.estimate import Box, Estimate, FrameError, Outcome
 from runtime.estimator import Estimator
 from runtime.frames import EventError, FrameStream, events_to_frames
@@ -16,6 +17,7 @@ from runtime.scene import Scene, SceneError
 from runtime.tracker import Tracker
 
 __all__ = [
+    "Attitude",
     "Box",
     "Estimate",
     "Estimator",

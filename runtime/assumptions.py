@@ -13,12 +13,33 @@ def assumptions(scene: Scene) -> list[str]:
     near = f" within {tolerance.line_px} px" if tolerance.line_px else ""
     lines = [
         "The state lies in the scene's domain; a box that reaches a face of the domain says so.",
-        f"No roll or yaw, and the camera as in the scene, up to its [calibration] and {tolerance.line_px} px.",
+        f"{_turn_of(scene)}, and the camera as in the scene, up to its [calibration] and {tolerance.line_px} px.",
         f"At most {tolerance.missed_budget} pixels of the runway's image have no lit pixel{near}.",
     ]
     if tolerance.extra_budget >= 0:
         lines.append(f"At most {tolerance.extra_budget} lit pixels of the true cell's spatial mask are not the runway's{near}.")
     return lines
+
+
+def _turn_of(scene: Scene) -> str:
+    """What is taken for granted of roll and yaw where no reference tells them."""
+    if scene.attitude is None:
+        return "No roll or yaw"
+    sides = (
+        f"{name} within {low:g} and {high:g} rad"
+        for name, (low, high) in (("Roll", scene.attitude.roll_rad), ("yaw", scene.attitude.yaw_rad))
+    )
+    return ", ".join(sides)
+
+
+def attitude_assumptions(scene: Scene, attitude: str, runs: int) -> list[str]:
+    """What takes the place of the first two assumptions where the camera has a roll and a yaw; `attitude` in words."""
+    tolerance = scene.tolerance
+    near = f" and {tolerance.line_px} px" if tolerance.line_px else ""
+    return [
+        "The state lies in the scene's domain with the pitch that the ideal frame shows, atan(tan(theta)/cos(yaw)), in the place of theta.",
+        f"The camera has a {attitude}, and is as in the scene, up to its [calibration]{near}; NN_F saw {runs} painted frames.",
+    ]
 
 
 def bounds_text(lower: Iterable[float], upper: Iterable[float]) -> str:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from runtime.assumptions import assumptions, prior_assumption
+from runtime.attitude import Attitude
 from runtime.estimate import Box, Estimate, FrameError, Outcome
 from runtime.model.entries import Entries
 from runtime.model.format import BOX_TENSORS, MASK_TENSORS, OVERFLOW, SPAN_TENSORS, ModelError
@@ -35,6 +36,7 @@ from runtime.refine.witnesses import witnesses
 from runtime.scene import STATE_NAMES, Scene, SceneError
 from runtime.sensor import Sensor
 from runtime.state_set import StateSet
+from runtime.turned import TurnedStart, hull_of, seen_box, started
 
 REFINED_BEYOND_PX = 2
 """How far beyond the spatial masks the refinement looks at pixels; those farther out it takes for lit."""
@@ -56,6 +58,8 @@ class Found:
     network_state: NDArray[np.float64]
     overflow: bool
     """More groups of a bank of windows passed than there are places: the others stand for all of their entries."""
+    turned: TurnedStart | None = None
+    """Where the camera is rolled or yawed: its attitude, and what of the bank passes (`runtime.turned`)."""
 
 
 class Estimator:
@@ -78,6 +82,8 @@ class Estimator:
         self._session = open_session(model.content, name, threads)
         check_interface(self._session, self.ideal, model.tensors["must_light_size"].shape, name)
         self.domain = Box(self.scene.domain.lower, self.scene.domain.upper)  # the hull of the cells
+        bounds = self.scene.attitude
+        self.attitude = None if bounds is None else Attitude.between(bounds.roll_rad, bounds.yaw_rad)
         window = self._entries.window_and_beyond(REFINED_BEYOND_PX)
         self._refiner = Refiner(self.ideal, int(self._budgets["missed_budget"]), int(self._budgets["extra_budget"]), window)
         budgets = {"missed_budget": self.missed_budget, "extra_budget": self.extra_budget}
@@ -138,57 +144,98 @@ class Estimator:
         """The model's own outputs for one frame (table in models/README.md). Raises `FrameError` as `estimate` does."""
         return self.run_unchecked(self.ideal_frame(frame))
 
-    def run_unchecked(self, pixels: NDArray[np.uint8]) -> dict[str, Any]:
-        """`run` for an ideal frame that is known to be uint8 (height, width) of {0, 1}: one call of onnxruntime.
+    def run_unchecked(self, pixels: NDArray[np.uint8], budgets: Mapping[str, NDArray[np.int32]] | None = None) -> dict[str, Any]:
+        """`run` for an ideal frame that is known to be uint8 (height, width) of {0, 1}: one call of onnxruntime. `budgets`: other ones.
 
         Raises `ModelError` if that fails, which it may for a file that no `sha256` vouches for.
         """
         try:
-            return dict(zip(self._outputs, self._session.run(self._outputs, {"frame": pixels, **self._budgets}), strict=True))
+            feed = {"frame": pixels, **self._budgets, **(budgets or {})}
+            return dict(zip(self._outputs, self._session.run(self._outputs, feed), strict=True))
         except Exception as error:  # onnxruntime raises classes of its own that share only this one
             raise ModelError(f"{self._name}: onnxruntime cannot run it ({reason_of(error)}); export it again") from error
 
-    def estimate(self, frame: NDArray, proposal: ArrayLike | None = None, refine: bool = True, prior: Box | None = None) -> Estimate:
+    def estimate(
+        self,
+        frame: NDArray,
+        proposal: ArrayLike | None = None,
+        refine: bool = True,
+        prior: Box | None = None,
+        attitude: Attitude | None = None,
+    ) -> Estimate:
         """State and certified box of one frame.
 
         `frame`: (height, width), bool, or uint8 of {0, 1}. `proposal`: a state (4,) from elsewhere to be checked in place of NN_e's.
         `refine`: contract the passing entries to what the frame can tell (`runtime.refine`); without it, the box is their hull. `prior`: a
         box that is known to hold the state (Theorem C); if it contradicts a frame which has a state without it, the outcome is
-        INCONSISTENT. Raises `FrameError` for any other frame and ValueError for a proposal of another shape.
+        INCONSISTENT. `attitude`: roll and yaw of the camera, by default the scene's; the frame is its sensor's own (`runtime.turned`), and
+        Theorem A alone is used. Raises `FrameError` for any other frame and ValueError for a proposal of another shape.
         """
         state = None if proposal is None else self._checked_proposal(proposal)
-        found = self.find(frame)
+        attitude = attitude or self.attitude
+        found = self.find(frame, attitude, prior)
         if prior is None:
-            return self.concluded(found, self._regions(found, refine), self.assumed, proposal=state)
-        left = self.left_of(found, self.covering(prior), refine)
+            return self._alone(found, refine, state)
+        left = self.left_of(found, self.covering(prior, attitude), refine)
         parts = None if refine else [np.arange(len(left))]
-        regions = regions_of(left, self.domain, parts) if len(left) else ()
-        otherwise = Outcome.INCONSISTENT if not regions and self._regions(found, refine) else Outcome.NO_RUNWAY
-        return self.concluded(found, regions, (*self.assumed, prior_assumption(prior.lower, prior.upper)), otherwise, state)
+        regions = self.regions(found, left, parts) if len(left) else ()
+        otherwise = Outcome.NO_RUNWAY
+        if not regions and self._alone(found if attitude is None else self.find(frame, attitude), refine).certified:
+            otherwise = Outcome.INCONSISTENT
+        assumed = (*self.assumed_of(found), prior_assumption(prior.lower, prior.upper))
+        return self.concluded(found, regions, assumed, otherwise, state, left)
 
-    def find(self, frame: NDArray) -> Found:
-        """What the model says of a frame. Raises `FrameError` as `estimate` does."""
-        own = self._checked_frame(frame)
-        pixels = self.sensor.painted(own)
-        outputs = self.run_unchecked(pixels)
+    def find(self, frame: NDArray, attitude: Attitude | None = None, prior: Box | None = None) -> Found:
+        """What the model says of a frame; of one of a rolled or yawed camera, at the pitches that a prior allows.
+
+        Raises `FrameError` as `estimate` does, and ValueError for an attitude with a plus-minus in [calibration], or with a
+        budget of missed pixels behind a lens.
+        """
+        own, turned = self._checked_frame(frame), None
+        if attitude is None:
+            pixels = self.sensor.painted(own)
+            outputs = self.run_unchecked(pixels)
+        else:
+            if not self.scene.calibration.exact:
+                raise ValueError("attitude: found a scene with a plus-minus in [calibration]; give that of roll and yaw with the attitude")
+            if self.sensor.map is not None and self.missed_budget > 0:
+                raise ValueError(f"attitude: found missed_budget {self.missed_budget} behind a lens; load the model with 0")
+            pixels, seen = own, self._seen(prior, attitude)
+            outputs, turned = started(self.sensor, self._entries, self._run_by_theorem_a, own, attitude, seen)
         overflow = bool(outputs.pop(OVERFLOW, False))
         cell, support, mismatch, passes, lower, upper, filtered, network_state = outputs.values()
         network = np.where(self.scene.domain.fixed, self.domain.lower, network_state)
         if pixels is not own:
             filtered = own & self.sensor.seen_in(filtered.view(np.bool_))
-        return Found(pixels, int(cell), support, mismatch, passes, lower, upper, filtered, network, overflow)
+        return Found(pixels, int(cell), support, mismatch, passes, lower, upper, filtered, network, overflow, turned)
 
-    def covering(self, prior: Box) -> StateSet:
+    def _run_by_theorem_a(self, pixels: NDArray[np.uint8], met_by_one: int) -> dict[str, Any]:
+        """`run_unchecked` of a painted frame, in which a missed pixel may spoil several; without Theorem B, which nobody vouches for."""
+        budgets = {"missed_budget": self.missed_budget * met_by_one, "extra_budget": -1}
+        return self.run_unchecked(pixels, {name: np.array(budget, dtype=np.int32) for name, budget in budgets.items()})
+
+    def _seen(self, box: Box | None, attitude: Attitude | None) -> Box | None:
+        """The part of a box, of the camera's pitch, that lies in the domain, of the ideal frame's; None where there is none."""
+        if box is None:
+            return self.domain
+        if attitude is not None:
+            box = seen_box(box, attitude)
+        low, high = np.maximum(box.lower, self.domain.lower), np.minimum(box.upper, self.domain.upper)
+        return None if (low > high).any() else Box(low, high)
+
+    def covering(self, prior: Box, attitude: Attitude | None = None) -> StateSet:
         """The part of a box that lies in the domain's hull, as a set of states; no set where there is none."""
-        low, high = np.maximum(prior.lower, self.domain.lower), np.minimum(prior.upper, self.domain.upper)
-        if (low > high).any():
-            return self._entries.all[:0]
-        return covering(self.ideal.camera, Box(low, high), self.ideal.camera.v0)
+        box = self._seen(prior, attitude)
+        return self._entries.all[:0] if box is None else covering(self.ideal.camera, box, self.ideal.camera.v0)
 
     def left_of(self, found: Found, known: StateSet | None = None, refine: bool = True) -> StateSet:
-        """Sets that hold every state which is consistent with the frame and, by Theorem C, lies in one of the `known` sets."""
+        """Sets that hold every state which is consistent with the frame and, by Theorem C, lies in one of the `known` sets.
 
+        Of a rolled or yawed camera, their theta is the pitch that the ideal frame shows, and so is that of the `known` ones.
+        """
         cut = None if known is None else partial(within, self.ideal.camera, known=known)
+        if found.turned is not None:
+            return found.turned.left(self._refiner, cut, refine)
         frame, line_px = found.pixels.view(np.bool_), self.ideal.tolerance.line_px
         if refine and self._refiner.extra_budget >= 0 and line_px == 0:  # Theorem B's claims are made at tolerance 0 only
             return refined_by_cell(self._refiner, self._entries, found.passes, frame, cut)
@@ -205,8 +252,12 @@ class Estimator:
         assumed: tuple[str, ...],
         otherwise: Outcome = Outcome.NO_RUNWAY,
         proposal: NDArray[np.float64] | None = None,
+        left: StateSet | None = None,
     ) -> Estimate:
-        """The estimate whose box is the hull of `regions`; its outcome is `otherwise` where there are none."""
+        """The estimate whose box is the hull of `regions`; its outcome is `otherwise` where there are none.
+
+        `left`: the sets that they are around, which a rolled or yawed camera's faces of the domain are seen by.
+        """
         box = Box.around(regions)
         state, used_fallback = self._shielded(box, found.network_state if proposal is None else proposal)
         return Estimate(
@@ -220,17 +271,28 @@ class Estimator:
             mismatch=int(found.mismatch[found.cell]),
             filtered=found.filtered,
             regions=regions,
-            touches_boundary=box is not None and self.scene.domain.reaches_boundary(box.lower, box.upper),
+            touches_boundary=box is not None and self._reaches_boundary(found, box, left),
             assumed=assumed,
         )
 
-    def _regions(self, found: Found, refine: bool) -> tuple[Box, ...]:
-        """What is consistent with the frame alone, as boxes."""
-        passing = np.flatnonzero(found.support)
-        if refine and len(passing):
-            return regions_of(self.left_of(found), self.domain)
-        cells = [np.arange(len(passing))] if len(passing) else []
-        return hulls(found.cell_lower[passing], found.cell_upper[passing], cells, self.domain)
+    def assumed_of(self, found: Found) -> tuple[str, ...]:
+        """What a certificate by this frame rests on, in words."""
+        return self.assumed if found.turned is None else found.turned.assumed(self.assumed)
+
+    def regions(self, found: Found, left: StateSet, parts: Sequence[NDArray[np.int64]] | None = None) -> tuple[Box, ...]:
+        """Boxes around parts of what is left, by default the connected ones; of a rolled or yawed camera, by its own pitch."""
+        return regions_of(left, self.domain, parts) if found.turned is None else found.turned.regions(left, self.domain, parts)
+
+    def _alone(self, found: Found, refine: bool, proposal: NDArray[np.float64] | None = None) -> Estimate:
+        """The estimate by the frame alone."""
+        passing, left = np.flatnonzero(found.support), None
+        if found.turned is not None or (refine and len(passing)):
+            left = self.left_of(found, refine=refine)
+            regions = self.regions(found, left, None if refine else [np.arange(len(left))]) if len(left) else ()
+        else:
+            cells = [np.arange(len(passing))] if len(passing) else []
+            regions = hulls(found.cell_lower[passing], found.cell_upper[passing], cells, self.domain)
+        return self.concluded(found, regions, self.assumed_of(found), proposal=proposal, left=left)
 
     def ideal_frame(self, frame: NDArray) -> NDArray[np.uint8]:
         """What NN_F sees of a frame: the frame, or behind a lens what is painted of it. Raises `FrameError` as `estimate` does."""
@@ -263,6 +325,11 @@ class Estimator:
     def spatial_mask(self, cell: int) -> NDArray[np.bool_]:
         """S of a cell, (height, width): every pixel that one of its states can light, widened by the tolerance."""
         return self.sensor.seen_in(self._entries.within(cell, np.ones(self.ideal.camera.shape, dtype=np.bool_)))
+
+    def _reaches_boundary(self, found: Found, box: Box, left: StateSet | None) -> bool:
+        """True if a box reaches a face of the domain; of a rolled or yawed camera, if what is left does, by the ideal frame's pitch."""
+        seen = box if found.turned is None or left is None else hull_of(left)
+        return self.scene.domain.reaches_boundary(seen.lower, seen.upper)
 
     @staticmethod
     def _shielded(box: Box | None, proposal: NDArray[np.float64]) -> tuple[NDArray[np.float64] | None, bool]:

@@ -17,6 +17,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.attitude import camera_pitch, lead, seen_pitch
 from runtime.estimate import Box, axis_number
 from runtime.refine.altitude import contract_by_altitude
 from runtime.refine.refiner import joined
@@ -33,6 +34,8 @@ SHORTEST_US = 1e-6
 """What moves in a shorter time is bounded by what may move in up to this one: products of such times with rates have no digits left."""
 LATEST_US = 2**63
 """Instants lie before this one, and after its negative: 300,000 years."""
+STEEPEST_RAD = 1.57
+"""Pitches of a domain lie within right angles; one that may have moved beyond is no state of it."""
 FLAT = 1e-9
 """A slope in delta of no more than so much of its terms counts as both up and down: far above float64's error, and sound either way."""
 
@@ -47,7 +50,7 @@ def instant(time_us: float) -> int | Fraction:
 
 @dataclass(frozen=True)
 class Displacement:
-    """Bounds on how far a state has moved, (4,) each, or (states, 4) of several; infinite where nothing is known."""
+    """Bounds on how far a state has moved, (4,) each, or (sets, 4) of several; infinite where nothing is known."""
 
     lower: Floats
     upper: Floats
@@ -124,7 +127,10 @@ def moved_each(camera: Camera, unions: Sequence[StateSet], by: Sequence[Displace
     if not unions:
         return []
     sets, union = joined(*unions), np.arange(len(unions)).repeat([len(each) for each in unions])
-    step = Displacement(*(np.stack([getattr(each, side) for each in by])[union] for side in ("lower", "upper")))
+    sides = (
+        [np.broadcast_to(getattr(each, side), (len(own), 4)) for each, own in zip(by, unions, strict=True)] for side in ("lower", "upper")
+    )
+    step = Displacement(*(np.concatenate(side) for side in sides))
     low, high = moved_box(sets.lower, sets.upper, step)
     low, high = np.maximum(low, domain.lower), np.minimum(high, domain.upper)
     inside = np.all(low <= high, axis=1)
@@ -136,6 +142,24 @@ def moved_each(camera: Camera, unions: Sequence[StateSet], by: Sequence[Displace
     left = ~after.empty
     after, borders = after[left], np.searchsorted(union[left], np.arange(len(unions) + 1))
     return [after[start:stop] for start, stop in itertools.pairwise(borders.tolist())]
+
+
+def with_pitches(sets: StateSet, by: Displacement, yaw_before: tuple[float, float], yaw_after: tuple[float, float]) -> Displacement:
+    """The displacement of sets whose theta is the pitch that the ideal frame shows, at one yaw before and another one after, (sets, 4).
+
+    `by` is that of the camera's own pitch, from which the other differs by `runtime.attitude.lead`.
+    """
+    before, after = (np.tile(yaw, (len(sets), 1)) for yaw in (yaw_before, yaw_after))
+    pitch = camera_pitch(sets.theta, before)
+    ahead = lead(sets.theta, pitch, before)
+    low, high = pitch[:, 0] + by.lower[0], pitch[:, 1] + by.upper[0]
+    pitch = np.clip(np.stack([lowered(low, np.abs(low)), raised(high, np.abs(high))], axis=-1), -STEEPEST_RAD, STEEPEST_RAD)
+    behind = lead(seen_pitch(pitch, after), pitch, after)
+    lower, upper = (np.tile(side, (len(sets), 1)) for side in (by.lower, by.upper))
+    terms = np.abs(ahead).max(axis=1) + np.abs(behind).max(axis=1)
+    lower[:, 0] += lowered(behind[:, 0] - ahead[:, 1], terms)
+    upper[:, 0] += raised(behind[:, 1] - ahead[:, 0], terms)
+    return Displacement(lowered(lower, np.abs(lower)), raised(upper, np.abs(upper)))
 
 
 def _moved_scale(sets: StateSet, theta: Floats, y: Floats, by: Displacement) -> Floats:

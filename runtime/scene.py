@@ -45,6 +45,8 @@ DISTORTIONS = {"radial-tangential": (4, 5), "fisheye": (4,)}
 """Models of a lens, and how many coefficients each has."""
 LARGEST_COEFFICIENT = 1e3
 """Largest coefficient of a lens: far beyond any that is real, so that none overflows."""
+LARGEST_TURN_RAD = 0.75
+"""Largest roll or yaw of a camera, its plus-minus included: one that is turned farther sees its runway sideways."""
 INSTANTS = {"start": 0.0, "middle": 0.5, "end": 1.0}
 """Instants of a window of events, and the share of it that lies before them."""
 
@@ -149,8 +151,8 @@ class Camera:
 
     @property
     def pinhole(self) -> bool:
-        """True if the frame is the ideal one: no distortion, and no turn in the aircraft."""
-        return (self.distortion is None or self.distortion.none) and (self.mount is None or self.mount == Mount())
+        """True if the frame of a level camera is the ideal one: no distortion."""
+        return self.distortion is None or self.distortion.none
 
     @property
     def u0(self) -> float:
@@ -302,15 +304,34 @@ class MotionBounds:
     x_m_s: tuple[float, float]
     y_m_s: tuple[float, float]
     z_m_s: tuple[float, float]
+    roll_rad_s: tuple[float, float] | None = None
+    yaw_rad_s: tuple[float, float] | None = None
+    """Of the aircraft, for attitudes between two readings."""
 
     def __post_init__(self) -> None:
-        for field, (low, high) in zip(dataclasses.fields(self), self.rates, strict=True):
-            _demand(low <= high, f"motion.{field.name}", [low, high], "give the least and the largest rate, in that order")
+        for field in dataclasses.fields(self):
+            rates = getattr(self, field.name)
+            if rates is not None:
+                _demand(rates[0] <= rates[1], f"motion.{field.name}", list(rates), "give the least and the largest rate, in that order")
 
     @property
     def rates(self) -> tuple[tuple[float, float], ...]:
         """Least and largest rate of theta, x, y and z."""
         return self.theta_rad_s, self.x_m_s, self.y_m_s, self.z_m_s
+
+
+@dataclass(frozen=True)
+class AttitudeBounds:
+    """The camera's roll and yaw, least and largest, where no reference tells them."""
+
+    roll_rad: tuple[float, float] = (0.0, 0.0)
+    yaw_rad: tuple[float, float] = (0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            low, high = getattr(self, field.name)
+            usable = -LARGEST_TURN_RAD <= low <= high <= LARGEST_TURN_RAD
+            _demand(usable, f"attitude.{field.name}", [low, high], f"give the least and the largest, within {LARGEST_TURN_RAD} rad")
 
 
 @dataclass(frozen=True)
@@ -357,6 +378,7 @@ class Scene:
     estimator: EstimatorTraining = EstimatorTraining()
     motion: MotionBounds | None = None
     window: EventWindow | None = None
+    attitude: AttitudeBounds | None = None
 
     def __post_init__(self) -> None:
         low, high = self.domain.lower, self.domain.upper  # the hull's: the runtime's sets are cut to it
@@ -366,8 +388,9 @@ class Scene:
         widest = math.pi / 2 - SMALLEST_ANGLE_AHEAD_RAD
         ahead = -widest <= flattest and steepest <= widest
         _demand(ahead, "domain", "a state with the runway behind the camera (Z <= 0)", "narrow theta_rad, y_m or z_m")
-        _demand(self.camera.mount in (None, Mount()), "camera.mount", "a camera that is turned in the aircraft", "only 0 is taken so far")
         self._check_margin(nearest, farthest)
+        told = self.attitude is None or self.calibration.exact
+        _demand(told, "attitude", "a roll or yaw beside a plus-minus in [calibration]", "add that of roll and yaw to [attitude] instead")
 
     def _check_margin(self, nearest: float, farthest: float) -> None:
         """The margin of `runtime.rounding` is twice float64's error on rows and columns in view, or more. Raises `SceneError`.

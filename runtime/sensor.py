@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,6 +38,11 @@ class Sensor:
         painting = Painting.of(sensor)
         count = ideal_pixels_a_pixel(scene, sensor, painting)
         return Sensor(scene, ideal_scene(scene, sensor.ideal, count), count, sensor, painting)
+
+    @cached_property
+    def still(self) -> SensorMap:
+        """The map of the sensor, a pinhole's too, for no rotation."""
+        return SensorMap.of(self.scene) if self.map is None else self.map
 
     def painted(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The ideal frame of a sensor's frame, uint8 of {0, 1} both: as it is, or painted outward.

@@ -13,6 +13,9 @@ and s(theta, t) = sin(psi)/cos(phi) = t cos(theta) + sin(theta). Then
 
 Every monotonicity that is used is one of these, or is checked over the set where it depends on it (`end_rows`). Results are
 plain float64 bounds, which `runtime.rounding` turns outward where they are used; `contract` alone does so itself.
+
+Where the camera is rolled or yawed, theta is the pitch that the ideal frame shows, rows and columns are those of the ideal frame, and every
+set has intervals of the camera's roll and yaw besides (`runtime.attitude`).
 """
 
 from __future__ import annotations
@@ -23,6 +26,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from runtime.attitude import Turns
 from runtime.rounding import lowered, raised
 from runtime.scene import Camera
 from runtime.turn import cosine_and_sine
@@ -34,6 +38,8 @@ Floats = NDArray[np.float64]
 class StateSet:
     """A batch of sets of states; every field is (sets, 2), lower and upper, except `tangent`, (sets,): t_ref of the reference row.
 
+    `roll` and `yaw` are None where the frame is the ideal one.
+
     A set is empty where an interval is inverted; enclosures of an empty set are empty or arbitrary, never unsound.
     """
 
@@ -43,16 +49,21 @@ class StateSet:
     z: Floats
     scale: Floats
     tangent: Floats
+    roll: Floats | None = None
+    yaw: Floats | None = None
 
     def __len__(self) -> int:
         return len(self.theta)
 
     def __getitem__(self, index: NDArray[np.int64] | NDArray[np.bool_] | slice) -> StateSet:
         if isinstance(index, slice):
-            return StateSet(self.theta[index], self.x[index], self.y[index], self.z[index], self.scale[index], self.tangent[index])
+            turn = (None if side is None else side[index] for side in (self.roll, self.yaw))
+            return StateSet(self.theta[index], self.x[index], self.y[index], self.z[index], self.scale[index], self.tangent[index], *turn)
         numbers = np.flatnonzero(index) if index.dtype == np.bool_ else index
         theta, x, y, z, scale = (side.T.take(numbers, axis=1).T for side in (self.theta, self.x, self.y, self.z, self.scale))
-        return StateSet(theta, x, y, z, scale, self.tangent.take(numbers))
+        if self.roll is None or self.yaw is None:
+            return StateSet(theta, x, y, z, scale, self.tangent.take(numbers))
+        return StateSet(theta, x, y, z, scale, self.tangent.take(numbers), self.roll[numbers], self.yaw[numbers])
 
     @property
     def empty(self) -> NDArray[np.bool_]:
@@ -81,6 +92,13 @@ class StateSet:
         sets.__dict__.update(self.__dict__)
         sets.__dict__.update(fields)
         return sets
+
+    @cached_property
+    def turns(self) -> Turns:
+        """The rotations from the ideal frame to the sensor's, of sets with roll and yaw."""
+        assert self.roll is not None
+        assert self.yaw is not None
+        return Turns.of(self.theta, self.roll, self.yaw)
 
     @cached_property
     def turn(self) -> tuple[Floats, Floats]:

@@ -18,13 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.assumptions import prior_assumption
+from runtime.attitude import Attitude
 from runtime.estimate import Box, Estimate, Outcome
 from runtime.estimator import Estimator, Found
-from runtime.motion import STANDSTILL, Displacement, Motion, instant, moved_box, moved_each
+from runtime.motion import STANDSTILL, Displacement, Motion, instant, moved_box, moved_each, with_pitches
 from runtime.refine.refiner import joined
-from runtime.refine.regions import regions_of
 from runtime.refine.slices import all_but, covering, slice_edges, sliced, sliced_each, within
 from runtime.state_set import StateSet
+
+NO_YAW = 0.0, 0.0
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,8 @@ class Seen:
 
     sets: StateSet
     since: Displacement
+    yaw: tuple[float, float] = NO_YAW
+    """Of the camera then: where it was yawed, theta of the sets is the pitch that the ideal frame showed (`runtime.attitude`)."""
 
     def later(self, step: Displacement) -> Seen:
         """The same after another displacement."""
@@ -68,6 +72,7 @@ class Tracker:
         self._latest: tuple[Box, Displacement] | None = None
         self._time_us: int | Fraction | None = None
         self._first_us: int | Fraction | None = None
+        self._attitude: Attitude | None = None
 
     def update(
         self,
@@ -75,24 +80,26 @@ class Tracker:
         time_us: float,
         prior: Box | None = None,
         displacement: Mapping[str, tuple[float, float]] | None = None,
+        attitude: Attitude | None = None,
     ) -> Estimate:
         """State and certified box of the next frame, whose instant is `time_us`.
 
         `prior`: a box that is known to hold the state now. `displacement`: bounds on how far the state has moved since the last update
-        that was not late, by axis: {"theta": (low, high)}; axes that are not named follow the motion. Where frame, prior and the frames
+        that was not late, by axis: {"theta": (low, high)}; axes that are not named follow the motion. `attitude`: of the camera now, by
+        default the scene's. Where frame, prior and the frames
         before contradict each other, the outcome is INCONSISTENT, and the tracker goes on from this frame alone. Nothing rests on a frame
         in which no state fits by itself; the displacement told with it counts. A frame older than the last one is estimated by itself and
         counted in `late`: after a time that was wrong, and far ahead, every frame is, until `reset`. Raises `FrameError` as
         `Estimator.estimate` does, and ValueError for a time that is not finite and for a displacement of another axis, or of bounds that
         are not ordered; the tracker is then as it was before, and the displacement told next is since the update before.
         """
-        now_us = instant(time_us)
+        now_us, attitude = instant(time_us), attitude or self.estimator.attitude
         step = self._step(now_us, displacement)
         if step is None:
             self.late += 1
-            return self.estimator.estimate(frame, prior=prior)
-        found = self.estimator.find(frame)
-        self._time_us = now_us
+            return self.estimator.estimate(frame, prior=prior, attitude=attitude)
+        found = self.estimator.find(frame, attitude)
+        self._time_us, self._attitude = now_us, attitude
         self._earlier = tuple(seen.later(step) for seen in self._earlier)
         self._latest = None if self._latest is None else (self._latest[0], self._latest[1] + step)
         left, seen = self._left(found, prior)
@@ -129,18 +136,20 @@ class Tracker:
         left = self.estimator.left_of(found, within(self._camera, held[-1], alone))
         if self.outliers == 0:
             return left, alone
-        return joined(left, held[-2]), alone  # if this frame is one of the outliers, what one fewer of the others leave
+        others = held[-2] if found.turned is None else found.turned.of(held[-2])
+        return joined(left, others), alone  # if this frame is one of the outliers, what one fewer of the others leave
 
     def _read(self, found: Found, known: StateSet | None, prior: Box | None) -> StateSet:
         """What is consistent with the frame and lies within the `known` sets and the prior."""
         if prior is not None:
-            here = self.estimator.covering(prior)
+            here = self.estimator.covering(prior, self._attitude)
             known = here if known is None else within(self._camera, known, here)
         return self.estimator.left_of(found, known)
 
     def _held(self) -> list[StateSet]:
         """For q = 0 to `outliers`: the states of the domain that lie in what all but q of the earlier frames leave possible now."""
-        parts = moved_each(self._camera, [seen.sets for seen in self._earlier], [seen.since for seen in self._earlier], self._domain)
+        unions = [seen.sets for seen in self._earlier]
+        parts = moved_each(self._camera, unions, [self._moved_by(seen) for seen in self._earlier], self._domain)
         if len(parts) == 1 and self.outliers == 0:
             return parts
         whole = covering(self._camera, self._domain, self._camera.v0)
@@ -156,46 +165,52 @@ class Tracker:
         start, *sources = sliced_each(self._camera, [whole, *parts], edges, tangent)
         return [sets[~sets.empty] for sets in all_but(sources, start, self.outliers)]
 
+    def _moved_by(self, seen: Seen) -> Displacement:
+        """How far the states of an earlier frame have moved, by the pitch that the ideal frame shows then and now."""
+        yaw = NO_YAW if self._attitude is None else self._attitude.yaw
+        return seen.since if (seen.yaw, yaw) == (NO_YAW, NO_YAW) else with_pitches(seen.sets, seen.since, seen.yaw, yaw)
+
     def _followed(self, found: Found, left: StateSet, seen: StateSet, prior: Box | None) -> Estimate:
         """The estimate of what is left; this frame is one of the earlier ones from now on."""
         earlier = () if self.horizon is None else self._earlier[max(len(self._earlier) + 2 - self.horizon, 0) :]
         kept = self.horizon is None or self.horizon > 1
         self._earlier = (*earlier, self._passed_on(seen)) if kept else ()
         self._first_us = self._time_us if self._first_us is None else self._first_us
-        estimate = self.estimator.concluded(found, regions_of(left, self._domain), self._assumed(prior))
+        estimate = self.estimator.concluded(found, self.estimator.regions(found, left), self._assumed(found, prior), left=left)
         assert estimate.box is not None
         self._latest = estimate.box, STANDSTILL
         return estimate
 
     def _contradicted(self, found: Found, prior: Box | None) -> Estimate:
         """The estimate of a frame that the earlier ones or the prior contradict, or in which no state fits; what is wrong is forgotten."""
-        assumed, alone = self._assumed(prior), self.estimator.left_of(found)
+        assumed, alone = self._assumed(found, prior), self.estimator.left_of(found)
         if len(alone) == 0 and self.outliers == 0:
             return self.estimator.concluded(found, (), assumed)
-        time_us = self._time_us
+        time_us, attitude = self._time_us, self._attitude
         self.reset()
-        self._time_us = time_us
+        self._time_us, self._attitude = time_us, attitude
         if len(alone) == 0:
             return self.estimator.concluded(found, (), assumed)
         self._first_us = time_us
         if self.horizon != 1:
             self._earlier = (self._passed_on(alone),)
         if self.outliers == 0:
-            self._latest = regions_of(alone, self._domain, [np.arange(len(alone))])[0], STANDSTILL
+            self._latest = self.estimator.regions(found, alone, [np.arange(len(alone))])[0], STANDSTILL
         return self.estimator.concluded(found, (), assumed, Outcome.INCONSISTENT)
 
     def _passed_on(self, sets: StateSet) -> Seen:
         """What a frame leaves, in slices of theta, at its instant."""
+        yaw = NO_YAW if self._attitude is None else self._attitude.yaw
         if len(sets) == 0:
-            return Seen(sets, STANDSTILL)
+            return Seen(replace(sets, roll=None, yaw=None), STANDSTILL, yaw)
         slices = sliced(self._camera, sets, slice_edges(sets.theta), float(np.median(sets.tangent)))
-        return Seen(slices[~slices.empty], STANDSTILL)
+        return Seen(slices[~slices.empty], STANDSTILL, yaw)
 
-    def _assumed(self, prior: Box | None) -> tuple[str, ...]:
+    def _assumed(self, found: Found, prior: Box | None) -> tuple[str, ...]:
         """What a box rests on, in words."""
         frames = "every frame that was followed" if self.horizon is None else f"each of the last {self.horizon} frames"
         if self.outliers:
             frames = f"of the last {self.horizon} frames all but {self.outliers} at most"
         since = "" if self._first_us is None else f" since {float(self._first_us):.16g} us"
         own = (f"Over time: this holds of {frames}{since}, and the state moves by {self.motion}, or as told.",)
-        return (*self.estimator.assumed, *(() if prior is None else (prior_assumption(prior.lower, prior.upper),)), *own)
+        return (*self.estimator.assumed_of(found), *(() if prior is None else (prior_assumption(prior.lower, prior.upper),)), *own)

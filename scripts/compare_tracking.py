@@ -27,7 +27,7 @@ from runtime import Estimate, Estimator, EventError, FrameStream, ModelError, Ou
 from runtime.errors import fail
 from runtime.explanation import missed_pixels
 from runtime.recordings.attitude import AttitudeError
-from runtime.recordings.follower import Follower, TrackingError
+from runtime.recordings.follower import Follower, References, TrackingError
 from runtime.recordings.gyroscope import GyroscopeError
 from runtime.recordings.recording import RecordingError, read_events
 from runtime.recordings.truth import Truth, TruthError
@@ -107,7 +107,9 @@ def main(
         ways |= {} if attitude is None else {"with the reference": (attitude, None)}
         ways |= {} if gyroscope is None else {"with the gyroscope": (None, gyroscope)}
         ways |= {} if attitude is None or gyroscope is None else {"with both": (attitude, gyroscope)}
-        followers = {name: Follower.of(estimator, *files, motion, horizon, outliers) for name, files in ways.items()}
+        followers = {
+            name: Follower.of(estimator, References(*files, pitch_alone=True), motion, horizon, outliers) for name, files in ways.items()
+        }
         bands = [band_of("the frame alone", lambda frame, _: estimator.estimate(frame), windows, broken)]
         bands += [band_of(name, follower.update, windows, broken) for name, follower in followers.items()]
     except (ModelError, RecordingError, EventError, TruthError, AttitudeError, GyroscopeError, TrackingError, OSError) as error:

@@ -15,7 +15,7 @@ light, or that of a neighbour within the block's motion, is a threshold away fro
 are larger than the texture's grain, far above the runway, this may miss an event.
 
 Writes approach.raw (Prophesee EVT3), approach.npz, truth.csv: the state at the instant of every window, from the first event on; and
-attitude.csv and gyroscope.csv: what an attitude reference and a gyroscope would say, for `run-model --track`.
+attitude.csv and gyroscope.csv: what an attitude reference and a gyroscope would say, for `run-model --track --pitch-alone`.
 At the defaults the windows are the paper's 1320 images at 25 per second. Exit code 2 if something given cannot be used.
 """
 

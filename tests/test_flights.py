@@ -19,7 +19,7 @@ from flights.sound import SoundFlight
 from random_scenes.outcomes import Outcomes
 from typer.testing import CliRunner
 
-from runtime import Box, Tracker, tracker
+from runtime import Box, Tracker, estimator
 
 MODEL = str(Path(__file__).parents[1] / "models" / "paper.onnx")
 
@@ -53,7 +53,7 @@ def test_a_prediction_that_stands_still_is_caught(monkeypatch: pytest.MonkeyPatc
 
 
 def test_boxes_that_are_cut_are_caught(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tracker, "regions_of", lambda sets, _: (Box(sets.lower.min(axis=0), sets.lower.max(axis=0)),))
+    monkeypatch.setattr(estimator, "regions_of", lambda sets, *_: (Box(sets.lower.min(axis=0), sets.lower.max(axis=0)),))
     assert "a box without the state" in {finding.fault for finding in flown(6).findings}
 
 

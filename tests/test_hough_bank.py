@@ -218,7 +218,7 @@ def test_a_pitch_that_ends_at_zero_loses_no_state() -> None:
 def test_bins_of_a_small_scale_begin_above_0() -> None:
     """Altitudes are divided by the scale; a runway so far away that its scale is below one step of the bins must not be lost."""
     smallest = SCALE_STEP / 3
-    (bins,) = _scale_bins(PAPER, np.array([[0.0, 0.0]]), np.array([smallest, 5 * SCALE_STEP]))
+    bins = _scale_bins(PAPER, np.array([0.0, 0.0]), np.array([smallest, 5 * SCALE_STEP]))
     assert 0 < bins[0, 0] <= smallest
     assert (bins[1:, 0] == bins[:-1, 1]).all()
     assert bins[-1, 1] >= 5 * SCALE_STEP

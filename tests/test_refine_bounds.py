@@ -13,7 +13,7 @@ from scenes import PAPER, Floats
 
 from build_model.verify.ball_camera import BallCamera
 from runtime.refine.altitude import contract_by_altitude
-from runtime.refine.borders import Borders, _column_margins_px, _ends
+from runtime.refine.borders import Borders, _column_margins_px, ends_in_rows
 from runtime.refine.ground import ground_distances
 from runtime.refine.lit_pixels import LitPixels
 from runtime.scene import Axis, Camera, Domain, Marking, Runway, Scene, SceneError
@@ -91,7 +91,7 @@ def spacing(sight: Sight) -> float:
 @given(sight=sights())
 def test_rows_of_ends(sight: Sight) -> None:
     focal, sets = sight.scene.camera.focal_v_px, sight.sets()
-    for (low, high), distance in zip(_ends(sight.scene, sets), sight.distances, strict=True):
+    for (low, high), distance in zip(ends_in_rows(sight.scene, sets), sight.distances, strict=True):
         row = sight.camera.row(float(sight.state[0]), arb(sight.state[2]), distance)
         assert arb(low[0, 0]) <= row
         assert row <= arb(high[0, 0])

@@ -659,6 +659,37 @@ def test_attitudes_that_cannot_be_used_are_refused(recording, tmp_path, text, fo
     assert found in done.stderr
 
 
+def test_a_recording_of_a_camera_that_rolls_and_yaws_is_certified_with_its_attitude(tmp_path):
+    """The boxes hold the camera's own state; taken for level, it shows no runway."""
+    pytest.importorskip("flint", reason="the extra 'build' is not installed")
+    from turned_state import TurnedState
+
+    rng, turned = np.random.default_rng(3), TurnedState.near(np.array([0.6, 0.0, 0.9, 1.7]), -0.03, 0.06)
+    roll, theta, yaw = (float(angle.mid()) for angle in turned.angles)
+    rows, columns = np.nonzero(turned.view(Estimator.load(MODEL).scene).image(turned.seen).frame)
+    parts = []
+    for number in range(3):
+        part = np.zeros(len(rows), dtype=EVENT)
+        part["x"], part["y"], part["t"] = columns, rows, np.sort(rng.integers(40_000 * number, 40_000 * (number + 1), len(rows)))
+        part["t"][0] = 40_000 * number
+        parts.append(part)
+    events = np.concatenate(parts)
+    np.savez(tmp_path / "rolled.npz", **{name: events[name] for name in "txyp"})
+    readings = np.array([[time_us, roll, -theta, yaw, 0.001, 0.002, 0.001] for time_us in (0, 60_000, 120_000)])
+    np.savetxt(tmp_path / "a.csv", readings, delimiter=",", header=",".join(ATTITUDE_COLUMNS), comments="")
+    states = np.array([[time_us, theta, 0.0, 0.9, 1.7] for time_us in (0, 120_000)])
+    np.savetxt(tmp_path / "truth.csv", states, delimiter=",", header="time_us,theta_rad,x_m,y_m,z_m", comments="", fmt="%.17g")
+    options = [MODEL, tmp_path / "rolled.npz", "-o", tmp_path / "out", "--no-video", "--track", "--motion", "0.01,0,0.01,0.01"]
+    done = invoke(*options, "--truth", tmp_path / "truth.csv", "--attitude", tmp_path / "a.csv")
+    assert (done.exit_code, done.stderr) == (0, "")
+    found = rows_of(tmp_path / "out")
+    assert [(row["outcome"], row["tracked_outcome"], row["tracked_truth_inside"]) for row in found] == [("certified", "certified", "1")] * 3
+    assert {row["assumptions_hold"] for row in found} == {""}
+    assert "Between two readings roll moves by 0 to 0 rad/s" in " ".join(done.stdout.split())
+    assert invoke(*options, "--attitude", tmp_path / "a.csv", "--pitch-alone").exit_code == 0
+    assert "certified" not in {row["tracked_outcome"] for row in rows_of(tmp_path / "out")}
+
+
 def test_windows_of_an_odd_length_are_certified_at_their_very_middle(recording, truth, tmp_path):
     done = invoke(MODEL, recording, "-o", tmp_path, "--truth", truth, "--no-video", "--window-ms", 40.001, "--track", "--motion", MOTION)
     assert done.exit_code == 0

@@ -207,7 +207,11 @@ BAD_VALUES: list[tuple[KeyPath, Any, str]] = [
     (("camera", "distortion"), {"model": "radial-tangential", "coefficients": [0.1] * 8}, "radial-tangential has 4 or 5 of them"),
     (("camera", "distortion"), {"model": "fisheye", "coefficients": [1e9] * 4}, "camera.distortion.coefficients: found"),
     (("camera", "mount"), {"roll_rad": 2.0}, "camera.mount.roll_rad: found 2.0"),
-    (("camera", "mount"), {"yaw_rad": 0.1}, "camera.mount: found a camera that is turned in the aircraft"),
+    (
+        ("motion",),
+        {name: [0, 0] for name in ("theta_rad_s", "x_m_s", "y_m_s", "z_m_s")} | {"yaw_rad_s": [1, 0]},
+        "motion.yaw_rad_s: found [1",
+    ),
     (("camera", "principal_point"), [320.0], "camera.principal_point: found [320.0]; give 2 values"),
     (("camera", "principal_point"), [320.0, 240.0, 1.0], "give 2 values"),
     (("camera", "principal_point"), [320.0, 1e9], "camera.principal_point: found (320.0, 1000000000.0)"),

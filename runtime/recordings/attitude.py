@@ -1,6 +1,7 @@
-"""What an attitude reference says: a CSV file of the aircraft's roll, pitch and yaw with their plus-minus, and the pitch at any instant.
+"""What an attitude reference says: a CSV file of the aircraft's roll, pitch and yaw with their plus-minus, and the angles at any instant.
 
-Aviation's signs: pitch is positive with the nose up, so that a camera along the aircraft's axis looks down by theta = -pitch.
+Aviation's signs: pitch is positive with the nose up, so that a camera along the aircraft's axis looks down by theta = -pitch; how a camera
+that is mounted otherwise is turned is in `runtime.attitude`.
 """
 
 from __future__ import annotations
@@ -11,10 +12,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.attitude import Angle, Attitude, mounted
 from runtime.estimate import Box
-from runtime.motion import Motion
+from runtime.motion import US_PER_S, Motion
 from runtime.recordings.timed_rows import rows_with_plus_minus
 from runtime.rounding import lowered, raised
+from runtime.scene import Mount, Scene
 
 ANGLES = ("roll", "pitch", "yaw")
 COLUMNS = ("time_us", *(f"{angle}_rad" for angle in ANGLES), *(f"{angle}_plus_minus_rad" for angle in ANGLES))
@@ -22,6 +25,44 @@ COLUMNS = ("time_us", *(f"{angle}_rad" for angle in ANGLES), *(f"{angle}_plus_mi
 
 class AttitudeError(ValueError):
     """A file of attitudes that cannot be used. One line: the file, what was found, what to do."""
+
+
+@dataclass(frozen=True)
+class Turning:
+    """The aircraft's least and largest rates of roll and yaw, rad/s; by default it does not turn between two readings."""
+
+    roll_rad_s: Angle = (0.0, 0.0)
+    yaw_rad_s: Angle = (0.0, 0.0)
+
+    @staticmethod
+    def of(scene: Scene) -> Turning:
+        """The scene's [motion]."""
+        rates = () if scene.motion is None else (scene.motion.roll_rad_s, scene.motion.yaw_rad_s)
+        return Turning(*(rate or (0.0, 0.0) for rate in rates))
+
+
+@dataclass(frozen=True)
+class Angles:
+    """Intervals of the aircraft's angles, rad: roll to the right wing, pitch down, yaw with the nose to the right of the runway's."""
+
+    roll: Angle
+    pitch_down: Angle
+    yaw: Angle
+
+    def of_camera(self, mount: Mount, domain: Box) -> tuple[Attitude, Box]:
+        """The attitude of a camera that is mounted so, and the domain with what that tells of its theta. Raises ValueError as `mounted`."""
+        attitude, theta = mounted(mount, self.roll, self.pitch_down, self.yaw)
+        return attitude, _with_pitch(domain, theta)
+
+
+def _with_pitch(domain: Box, theta: Angle) -> Box:
+    """The domain with these bounds on theta; with its own where they are infinite."""
+    low, high = theta
+    return domain.replace(theta=(domain.lower[0] if np.isinf(low) else low, domain.upper[0] if np.isinf(high) else high))
+
+
+def _joined(angles: list[Angle]) -> Angle:
+    return min(low for low, _ in angles), max(high for _, high in angles)
 
 
 @dataclass(frozen=True)
@@ -41,24 +82,34 @@ class AttitudeReadings:
             raise AttitudeError(error) from error
         return cls(rows[:, 0], rows[:, 1:4], rows[:, 4:])
 
-    def prior(self, time_us: float, motion: Motion, domain: Box) -> Box:
-        """The domain with theta as the readings before and after an instant allow it, each moved to that instant by the motion's bounds.
+    def at(self, time_us: float, motion: Motion, turning: Turning) -> Angles:
+        """The aircraft's angles at an instant, as the readings before and after it allow them, each moved to it by the bounds on the rates.
 
-        The interval holds what either reading allows; the domain's where the motion's bounds are infinite.
+        Each interval holds what either reading allows; it is infinite where the bounds on a rate are.
         """
         before = max(int(np.searchsorted(self.time_us, time_us, side="right")) - 1, 0)
         after = min(int(np.searchsorted(self.time_us, time_us)), len(self.time_us) - 1)
-        sides = [self._theta(row, time_us, motion) for row in (before, after)]
-        low, high = min(low for low, _ in sides), max(high for _, high in sides)
-        ends = domain.lower[0] if np.isinf(low) else low, domain.upper[0] if np.isinf(high) else high
-        return domain.replace(theta=ends)
+        pitch_rates = float(motion.rate_lower[0]), float(motion.rate_upper[0])  # of the pitch down
+        roll, down, yaw = (
+            _joined([self._angle(row, time_us, place, sign, rates) for row in (before, after)])
+            for place, sign, rates in ((0, 1, turning.roll_rad_s), (1, -1, pitch_rates), (2, 1, turning.yaw_rad_s))
+        )
+        return Angles(roll, down, yaw)
 
-    def _theta(self, row: int, time_us: float, motion: Motion) -> tuple[float, float]:
-        """The interval of theta at an instant by one reading alone, rounded outward."""
-        since = motion.over(time_us - self.time_us[row])
-        pitch, plus_minus = self.angles[row, 1], self.plus_minus[row, 1]
-        sides = (-pitch - plus_minus + since.lower[0], -pitch + plus_minus + since.upper[0])
-        terms = abs(pitch) + plus_minus + abs(since.lower[0]) + abs(since.upper[0])
+    def prior(self, time_us: float, motion: Motion, domain: Box) -> Box:
+        """The domain with theta as the readings allow it of a camera along the aircraft's axis; the domain's where they tell nothing."""
+        return _with_pitch(domain, self.at(time_us, motion, Turning()).pitch_down)
+
+    def _angle(self, row: int, time_us: float, place: int, sign: int, rates: Angle) -> Angle:
+        """The interval of an angle, of pitch with its sign turned, at an instant by one reading alone, rounded outward."""
+        angle, plus_minus = sign * self.angles[row, place], self.plus_minus[row, place]
+        elapsed_s = (time_us - self.time_us[row]) / US_PER_S
+        moved = sorted(rate * elapsed_s for rate in rates) if elapsed_s else [0.0, 0.0]
+        terms = abs(angle) + plus_minus + 2 * max(map(abs, moved))
+        exact = plus_minus == 0 and moved == [0.0, 0.0]
+        sides = angle - plus_minus + moved[0], angle + plus_minus + moved[1]
+        if exact or not np.isfinite(terms):
+            return sides
         return float(lowered(sides[0], terms)), float(raised(sides[1], terms))
 
     def level(self, roll_rad: float, yaw_rad: float) -> bool:

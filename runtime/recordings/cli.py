@@ -42,7 +42,7 @@ try:
         throughput,
     )
     from runtime.recordings.draw import png
-    from runtime.recordings.follower import Follower, TrackingError
+    from runtime.recordings.follower import Follower, References, TrackingError
     from runtime.recordings.gyroscope import GyroscopeError
     from runtime.recordings.latency_chart import latency_chart
     from runtime.recordings.noted import lines_of, noted_of
@@ -69,7 +69,10 @@ def run_model(
     refine: Annotated[bool, typer.Option("--refine/--no-refine", help="Contract the passing entries: tighter and slower.")] = True,
     track: Annotated[bool, typer.Option("--track", help="Certify over time too: each frame within what those before leave.")] = False,
     motion: Annotated[str | None, typer.Option(help="Largest rates of theta, x, y, z, as 0.1,0,0.3,1; by default the scene's.")] = None,
-    attitude: Annotated[Path | None, typer.Option(help="CSV of an attitude reference, whose pitch --track takes for known.")] = None,
+    attitude: Annotated[Path | None, typer.Option(help="CSV of an attitude reference: the aircraft's roll, pitch and yaw.")] = None,
+    pitch_alone: Annotated[
+        bool, typer.Option("--pitch-alone", help="Of --attitude: take roll and yaw for 0, as the scene has it.")
+    ] = False,
     gyroscope: Annotated[Path | None, typer.Option(help="CSV of a gyroscope, by which --track bounds how far the pitch turns.")] = None,
     horizon: Annotated[int | None, typer.Option(help="With --track: a box rests on the last so many windows alone.")] = None,
     outliers: Annotated[int, typer.Option(help="With --horizon: windows of it that may break their assumptions.")] = 0,
@@ -88,8 +91,8 @@ def run_model(
         gap_us, notes = _microseconds(largest_gap_ms), Notes()
         stream = FrameStream(estimator.scene.camera.shape, _microseconds(window_ms), step_us, largest_gap_us=gap_us)
         known = None if truth is None else Truth.load(truth)
-        follower = Follower.of(estimator, attitude, gyroscope, motion, horizon, outliers) if track else None
-        files = {"--attitude": attitude, "--gyroscope": gyroscope}
+        follower = Follower.of(estimator, References(attitude, gyroscope, pitch_alone), motion, horizon, outliers) if track else None
+        files = {"--attitude": attitude, "--gyroscope": gyroscope, "--pitch-alone": pitch_alone or None}
         _demand_track(track, {"--motion": motion, **files, "--horizon": horizon, "--outliers": outliers or None})
         packets = _nonempty(recording, read_events(recording, estimator.scene.camera.shape, notes))
         inputs = [path for path in (model, recording, truth, attitude, gyroscope) if path is not None]
@@ -110,7 +113,8 @@ def run_model(
         complain(f"{recording}: {line}")
     if fault:
         fail(f"{fault}; {summary['windows']} windows are written to {folder}", code)
-    if truth is not None and known is not None and "assumptions_hold" not in summary:
+    level = estimator.attitude is None and (follower is None or not follower.turned)
+    if truth is not None and known is not None and level and "assumptions_hold" not in summary:
         fail(_unmatched(truth, known, summary))
 
 
@@ -171,11 +175,12 @@ def _estimate_all(
     task = None if bar is None else bar.add_task("windows", total=None, seconds=0.0)
     seconds = 0.0
     for start_us, frame in stream.frames(packets):
+        attitude = None if follower is None else follower.known(start_us + report.instant_us)[0]
         begun = time.perf_counter()
-        estimate = report.estimator.estimate(frame, refine=refine)
+        estimate = report.estimator.estimate(frame, refine=refine, attitude=attitude)
         milliseconds = 1000 * (time.perf_counter() - begun)
         tracked = None if follower is None else follower.update(frame, start_us + report.instant_us)
-        report.add(start_us, frame, estimate, milliseconds, tracked)
+        report.add(start_us, frame, estimate, milliseconds, tracked, level=attitude is None and report.estimator.attitude is None)
         if bar is not None and task is not None:
             seconds += stream.step_us / 1e6
             bar.update(task, advance=1, seconds=seconds)

@@ -103,16 +103,27 @@ class Report:
         self._outputs.discard()
 
     def add(
-        self, start_us: int, frame: NDArray[np.uint8], estimate: Estimate, milliseconds: float, tracked: Estimate | None = None
+        self,
+        start_us: int,
+        frame: NDArray[np.uint8],
+        estimate: Estimate,
+        milliseconds: float,
+        tracked: Estimate | None = None,
+        level: bool = True,
     ) -> None:
-        """One window: its start, its frame, what the estimator made of it, how long that took, and what a tracker made of it."""
+        """One window: its start, its frame, what the estimator made of it, how long that took, and what a tracker made of it.
+
+        Of a camera that is not `level` no truth tells which pixels should be lit: windows are not judged or explained then.
+        """
         number = self.tally.counts["windows"]
         instant_us = start_us + self.instant_us
         earliest, latest = self._instants_us or (instant_us, instant_us)  # of all runs of a clock that went back, too
         self._instants_us = min(earliest, instant_us), max(latest, instant_us)
         state = self.truth.at(instant_us) if self.truth else None
-        judgement = None if state is None else judge(self.estimator.scene, frame, estimate, state, self.estimator.missed_budget)
-        explanation = None if estimate.certified else explain(self.estimator, frame, estimate)
+        judgement = (
+            None if state is None or not level else judge(self.estimator.scene, frame, estimate, state, self.estimator.missed_budget)
+        )
+        explanation = None if estimate.certified or not level else explain(self.estimator, frame, estimate)
         self.tally.add(estimate, milliseconds, judgement, explanation)
         if tracked is not None:
             self.tally.follow(tracked, state)

@@ -39,7 +39,7 @@ class Borders:
     @staticmethod
     def of(scene: Scene, sets: StateSet, pixels: LitPixels) -> Borders:
         """The borders between the farthest and the nearest ends; one row on either side stands for all rows out of the window."""
-        near, far = _ends(scene, sets)
+        near, far = ends_in_rows(scene, sets)
         first, last = (
             np.minimum(np.maximum(np.floor(row), pixels.top), pixels.bottom)
             for row in (np.minimum.reduce(far[0], axis=0), np.maximum.reduce(near[1], axis=0))
@@ -57,6 +57,27 @@ class Borders:
         """1 / R at both ends of its range, (rows + 1, sets); 1 above the horizon, where no border is crossed."""
         low, high = self.ratio
         return 1 / np.where(low > 0, low, 1.0), 1 / np.where(high > 0, high, 1.0)
+
+    def offsets(self, scene: Scene, first: Floats, last: Floats, rows: slice = slice(None)) -> Interval:
+        """Bounds on (p_x - x) scale of markings that cross the borders `rows` in the closed columns `first` to `last`; of that shape.
+
+        They mean nothing where a border is not crossed.
+        """
+        slow, fast = (side[rows] for side in self.per_ratio)
+        low, high = first - (scene.camera.u0 + self.margin_px), last + (1 - scene.camera.u0 + self.margin_px)
+        return np.minimum(low * slow, low * fast), np.maximum(high * slow, high * fast)
+
+    def seen_x(self, sets: StateSet) -> Interval:
+        """Range of the x that offsets refer to, (sets,), m: here the sets' own."""
+        return sets.x[:, 0], sets.x[:, 1]
+
+    def true_x(self, _: StateSet, low: Floats, high: Floats) -> Interval:
+        """Bounds on the states' x, (sets,), by bounds on the x that offsets refer to."""
+        return low, high
+
+    def ideal_rows(self, _: Scene, __: StateSet, lowest: Floats, highest: Floats) -> Interval:
+        """Rows of the ideal frame that near ends lie no lower, and far ends no higher in than in these of the sensor, (markings, sets)."""
+        return lowest, highest
 
     def across_rows(self) -> Interval:
         """First and last column that each marking may light in each row, (markings, rows, sets)."""
@@ -83,7 +104,7 @@ def _columns(scene: Scene, sets: StateSet, ratio: Interval, margin_px: Floats) -
     return np.floor(low, out=low), np.floor(high, out=high)
 
 
-def _ends(scene: Scene, sets: StateSet) -> tuple[Interval, Interval]:
+def ends_in_rows(scene: Scene, sets: StateSet) -> tuple[Interval, Interval]:
     """Ranges of the rows of each marking's near and far end, (markings, sets) each; equal distances are computed once.
 
     v - v0 = F_v tan(beta - theta), so an error of an angle grows by 1 + tan^2: that of rounding, of the altitude that a scale stands for,

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from runtime.refine.interval import Bits, Floats, Interval, relaxed_intersection
+from runtime.refine.interval import Bits, Floats, Interval, intersected, relaxed_intersection
 from runtime.refine.sight import Sight
 from runtime.state_set import StateSet
 
@@ -20,20 +20,21 @@ def offsets_at_crossings(_: StateSet, sight: Sight) -> Interval:
     borders, missed = sight.borders, sight.missed
     first, last = sight.halves.first, sight.halves.last
     if missed.budget == 0:
-        low, high = _offsets(sight, _at_borders(first, np.maximum), _at_borders(last, np.minimum), borders.per_ratio, borders.crossed)
+        bounds = borders.offsets(sight.scene, _at_borders(first, np.maximum), _at_borders(last, np.minimum))
+        low, high = _where(borders.crossed, *bounds)
         return np.maximum.reduce(low, axis=1), np.minimum.reduce(high, axis=1)
-    slow, fast = (np.stack([side[:-1], side[1:]])[:, None] for side in borders.per_ratio)
-    low, high = _offsets(sight, first, last, (slow, fast), sight.crossed & ~missed.halves)
-    low, high = np.maximum(low[0], low[1]), np.minimum(high[0], high[1])
+    usable = sight.crossed & ~missed.halves
+    upper, lower = (
+        _where(usable[half], *borders.offsets(sight.scene, first[half], last[half], rows))
+        for half, rows in enumerate((slice(None, -1), slice(1, None)))
+    )
+    low, high = intersected(upper, lower)
     return relaxed_intersection(low, high, np.maximum(missed.left, 0), missed.budget)
 
 
-def _offsets(sight: Sight, first: Floats, last: Floats, per_ratio: Interval, usable: Bits) -> Interval:
-    """Bounds from a first and a last lit column each; none where they are not usable."""
-    slow, fast = per_ratio
+def _where(usable: Bits, low: Floats, high: Floats) -> Interval:
+    """The bounds where they are usable, and none elsewhere."""
     none = np.where(usable, np.inf, -np.inf)
-    low, high = first - (sight.scene.camera.u0 + sight.borders.margin_px), last + (1 - sight.scene.camera.u0 + sight.borders.margin_px)
-    low, high = np.minimum(low * slow, low * fast), np.maximum(high * slow, high * fast)
     return np.minimum(low, none, out=low), np.maximum(high, np.negative(none, out=none), out=high)
 
 

@@ -18,7 +18,7 @@ def offsets_at_ends(sets: StateSet, sight: Sight) -> Interval:
     """
     borders, u0 = sight.borders, sight.scene.camera.u0
     complete = sight.missed.left == 0
-    if not complete.any():
+    if sets.roll is not None or not complete.any():
         return np.full(borders.near[0].shape, -np.inf), np.full(borders.near[0].shape, np.inf)
     row = np.floor(np.array([borders.far[1], borders.near[0]]))  # (ends, markings, sets), as all that follows
     slow, fast = _ratios(sets, sight, row)

@@ -22,4 +22,5 @@ def contract_by_ends(sets: StateSet, sight: Sight) -> StateSet:
     last = np.minimum.reduce(np.where(stops, row[:-1], np.inf), axis=1)
     first = np.maximum.reduce(np.where(starts, row[1:], -np.inf), axis=1)
     last, first = np.minimum(last, borders.near[1]), np.maximum(first, borders.far[0])
+    last, first = borders.ideal_rows(sight.scene, sets, last, first)
     return sets.contracted(z=z_of_rows(sight.scene.camera, sets, last, ends_z_m[:, 0], first, ends_z_m[:, 1]))

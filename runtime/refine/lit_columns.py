@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from runtime.refine.borders import Borders
 from runtime.refine.interval import Bits, Floats
 from runtime.refine.lit_pixels import LitPixels
+from runtime.refine.sensor_borders import SensorBorders
 
 
 @dataclass(frozen=True)
@@ -27,7 +28,7 @@ class LitColumns:
     dark: Bits
 
     @staticmethod
-    def of(pixels: LitPixels, borders: Borders) -> tuple[LitColumns, LitColumns]:
+    def of(pixels: LitPixels, borders: Borders | SensorBorders) -> tuple[LitColumns, LitColumns]:
         """Of the half-windows at the upper (0) and the lower (1) border of each row, (2, markings, rows, sets), and of the rows' windows.
 
         The first lit column from the outer one of two columns on is the outer one of the first lit ones from either on: no more look-ups.

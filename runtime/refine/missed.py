@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from runtime.refine.borders import Borders
 from runtime.refine.interval import Bits, Floats
 from runtime.refine.lit_columns import LitColumns
+from runtime.refine.sensor_borders import SensorBorders
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Missed:
     """The same of the rows' whole windows, (markings, rows, sets)."""
 
     @staticmethod
-    def count(budget: int, borders: Borders, halves: LitColumns, crossed: Bits) -> Missed:
+    def count(budget: int, borders: Borders | SensorBorders, halves: LitColumns, crossed: Bits) -> Missed:
         """`crossed`: half-windows whose border all states cross; `halves`: what the frame shows of them (`lit_columns`)."""
         dark: Bits = halves.dark & crossed
         sets, bound_nothing = dark.shape[-1], np.zeros(dark.shape[1:], dtype=bool)

@@ -58,6 +58,11 @@ class Search:
     rounds: int
     gain: float
     """At most so many rounds, and until one takes less than this share from every side of the box."""
+    roll: int = 1
+    yaw: int = 1
+    """As `theta`, where these are known up to a plus-minus alone."""
+    patience: int = 1
+    """So many rounds in a row must take less than the share."""
 
 
 FACES = 6
@@ -67,6 +72,10 @@ SOME_MISSED = Search(first=4, theta=3, z=2, scale=2, pieces=4, rounds=20, gain=0
 """Missed pixels are counted where windows are a pixel or two wide (`missed`): then smaller pieces pay, cut along the scale too."""
 NARROWED = Search(first=4, theta=3, z=2, scale=2, pieces=4, rounds=20, gain=0.002)
 """Pixels may be missed, and the entries were cut to a prior: they are few, so that there is time for small gains."""
+TURNED = Search(first=2, theta=2, z=1, scale=1, pieces=16, rounds=80, gain=0.002, roll=2, yaw=2, patience=3)
+"""Roll and yaw are known up to a plus-minus alone: half of it then tells more than half of a slice, and many pieces carry one face."""
+LEAST_SWAY_PX = 0.25
+"""A plus-minus that moves no point of the frame by this much is not cut."""
 LARGEST_START = 512
 """More passing entries than this say that the frame tells next to nothing: they are left as they are, at a bounded cost."""
 LARGEST_ROUND = 2**18
@@ -96,19 +105,35 @@ class Refiner:
         witnesses = LitPixels.of(frame, self.window, beyond=True)
         vouched = None if vouched_pixels is None else Vouched(LitPixels.of(vouched_pixels, self.window, beyond=False), self.extra_budget)
         search = NONE_MISSED if self.missed_budget == 0 else NARROWED if narrowed else SOME_MISSED
+        if entries.roll is not None and entries.yaw is not None:
+            entries = self._contracted(witnesses, vouched, entries)  # most contradict the frame as they are
+            search = self._with_turns(search, entries)
         most_sets = LARGEST_ROUND // (len(self.scene.runway.markings) * witnesses.rows)
         slices = min(max(most_sets // max(len(entries), 1), 1), search.first)
-        a_face = min(max(most_sets // (FACES * search.theta * search.z * search.scale), 1), search.pieces)
-        pieces = self._contracted(witnesses, vouched, _cut(entries, theta=slices))
-        extent = _extent(pieces)
+        finer_cuts = {name: getattr(search, name) for name in ("theta", "z", "scale", "roll", "yaw")}
+        a_face = min(max(most_sets // (FACES * math.prod(finer_cuts.values())), 1), search.pieces)
+        pieces = self._contracted(witnesses, vouched, _cut(entries, theta=slices, roll=search.roll, yaw=search.yaw))
+        extent, idle = _extent(pieces), 0
         for _ in range(search.rounds if len(pieces) else 0):
             outer = _carries_a_face(pieces, a_face)
-            finer = self._contracted(witnesses, vouched, _cut(pieces[outer], theta=search.theta, z=search.z, scale=search.scale))
+            finer = self._contracted(witnesses, vouched, _cut(pieces[outer], **finer_cuts))
             pieces, before = joined(finer, pieces[~outer]), extent
             extent = _extent(pieces)
-            if (extent > (1 - search.gain) * before).all():
+            idle = idle + 1 if (extent > (1 - search.gain) * before).all() else 0
+            if idle == search.patience:
                 break
         return pieces
+
+    def _with_turns(self, search: Search, entries: StateSet) -> Search:
+        """The search of entries with roll and yaw, which cuts them where their plus-minus moves a point of the frame visibly."""
+        camera = self.scene.camera
+        reach = {"roll": math.hypot(camera.width, camera.height) / 2, "yaw": max(camera.focal_u_px, camera.focal_v_px)}
+        widths = {name: float(np.ptp(getattr(entries, name), axis=1).max(initial=0.0)) * px for name, px in reach.items()}
+        cuts = {name: getattr(TURNED, name) for name, width_px in widths.items() if width_px >= LEAST_SWAY_PX}
+        if not cuts:
+            return search
+        finer = (search.z, search.scale) if self.missed_budget > 0 else (TURNED.z, TURNED.scale)
+        return replace(TURNED, z=finer[0], scale=finer[1], **{"roll": 1, "yaw": 1, **cuts})
 
     def _contracted(self, witnesses: LitPixels, vouched: Vouched | None, sets: StateSet) -> StateSet:
         """The sets without most of the states that the frame contradicts, and without empty sets."""
@@ -155,7 +180,8 @@ def joined(*parts: StateSet) -> StateSet:
     """All sets of the given batches in one."""
     if len(parts) == 1:
         return parts[0]
-    names = ("theta", "x", "y", "z", "scale", "tangent")
+    names = ["theta", "x", "y", "z", "scale", "tangent"]
+    names += ["roll", "yaw"] if all(part.roll is not None for part in parts) else []
     return StateSet(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 

@@ -13,6 +13,7 @@ from runtime.refine.interval import Bits
 from runtime.refine.lit_columns import LitColumns, at_both_borders
 from runtime.refine.lit_pixels import LitPixels
 from runtime.refine.missed import Missed
+from runtime.refine.sensor_borders import SensorBorders
 from runtime.scene import Scene
 from runtime.state_set import StateSet
 
@@ -30,7 +31,7 @@ class Sight:
     """The sets' borders, and what the frame's witnesses show at them; bounds made for the sets hold for all their subsets too."""
 
     scene: Scene
-    borders: Borders
+    borders: Borders | SensorBorders
     halves: LitColumns
     crossed: Bits
     """Half-windows whose border the marking crosses in all states of the set, (2, markings, rows, sets)."""
@@ -41,7 +42,7 @@ class Sight:
     @staticmethod
     def of(scene: Scene, sets: StateSet, witnesses: LitPixels, missed_budget: int, vouched: Vouched | None) -> Sight:
         """Looks at the frame where the sets' markings may be."""
-        borders = Borders.of(scene, sets, witnesses)
+        borders = (Borders if sets.roll is None else SensorBorders).of(scene, sets, witnesses)
         halves, rows = LitColumns.of(witnesses, borders)
         crossed = at_both_borders(borders.crossed)
         return Sight(scene, borders, halves, crossed, rows, Missed.count(missed_budget, borders, halves, crossed), vouched)

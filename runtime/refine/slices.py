@@ -67,7 +67,7 @@ def within(camera: Camera, sets: StateSet, known: StateSet) -> StateSet:
     other = rereferenced(replace(other, theta=theta), own.tangent)
     both = replace(own, **{name: _common(getattr(own, name), getattr(other, name)) for name in INTERVALS})
     hulls = _hulls(contract_by_altitude(camera, both), mine, len(sets), sets.tangent)
-    return hulls[~hulls.empty]
+    return replace(hulls, roll=sets.roll, yaw=sets.yaw)[~hulls.empty]
 
 
 def slice_edges(theta: Floats) -> Floats:

@@ -11,7 +11,7 @@ import itertools
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.refine.borders import across
+from runtime.refine.borders import Borders, across
 from runtime.refine.ground import z_of_rows
 from runtime.refine.interval import Interval, relaxed_intersection
 from runtime.refine.lit_columns import LitColumns
@@ -20,14 +20,13 @@ from runtime.state_set import StateSet
 
 
 def offsets_by_vouched(sets: StateSet, sight: Sight) -> Interval:
-    """Bounds on the offset (p_x - x) scale of each marking, (markings, sets), px; without bounds under Theorem A.
+    """Bounds on the offset (p_x - x) scale of each marking, (markings, sets), px; without bounds under Theorem A, and on a turned sensor.
 
     Inverted where more than `extra_budget` vouched pixels lie where no marking of the set can be.
     """
-    vouched, shape = sight.vouched, sight.borders.near[0].shape
-    if vouched is None:
-        return np.full(shape, -np.inf), np.full(shape, np.inf)
-    borders, u0 = sight.borders, sight.scene.camera.u0
+    vouched, borders, u0 = sight.vouched, sight.borders, sight.scene.camera.u0
+    if vouched is None or not isinstance(borders, Borders):
+        return np.full(borders.near[0].shape, -np.inf), np.full(borders.near[0].shape, np.inf)
     own = _of_one_marking(vouched, sight)
     across_low, across_high = across(sight.scene, sets)
     rises, falls = across_low[:, None] >= 0, across_high[:, None] <= 0

@@ -1,0 +1,292 @@
+"""Frames of a camera with roll and yaw: NN_F sees them painted onto the ideal frame, the refinement sees the sensor's own pixels.
+
+A rotation within the plus-minus, and what it does at a pitch, is an interval of rotations (`runtime.attitude`). Where that moves the ideal
+frame by more than about `BLUR_PX`, it is cut into bins of pitch, yaw and roll: each has a painted frame and a run of NN_F of its own.
+Theorem A holds of each: with at most m pixels of the sensor's image dark, at most c m of the painted frame's are, c being the pixels of
+the ideal frame that markings can meet inside one pixel of the sensor. So a state whose pitch, yaw and roll lie in a bin lies in an entry
+that passes there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from runtime.assumptions import attitude_assumptions
+from runtime.attitude import Attitude, Turns, camera_pitch, seen_pitch
+from runtime.estimate import Box
+from runtime.model.entries import Entries
+from runtime.model.format import OVERFLOW
+from runtime.painting import painted
+from runtime.refine.lit_pixels import LitPixels
+from runtime.refine.refiner import Refiner, joined
+from runtime.refine.regions import regions_of
+from runtime.refine.sensor_borders import SensorBorders
+from runtime.refine.slices import INTERVALS, rereferenced
+from runtime.refine.witnesses import witnesses
+from runtime.scene import Camera, Scene
+from runtime.sensor import Sensor
+from runtime.sensor_map import SensorMap, Turn
+from runtime.state_set import StateSet
+
+Floats = NDArray[np.float64]
+Bits = NDArray[np.bool_]
+
+BLUR_PX = 2.0
+"""Bins of pitch, yaw and roll are so narrow that none moves a point of the ideal frame by much more than this."""
+BEYOND_PX = 2
+"""How far beyond where the sets show their markings the refinement looks at pixels; those farther out it takes for lit."""
+MOST_BINS = 4096
+"""More runs of NN_F than this are not made: bins are wider then."""
+MOST_ENTRIES = 512
+"""More passing entries than this are refined as hulls of them."""
+FIRST_ROW_STEP = 2.0**-5
+"""Tangent of the rows that reference rows are put together by, at first."""
+MOST_DOUBLINGS = 6
+"""How often bins of scale and of reference rows are doubled for that."""
+
+
+@dataclass(frozen=True)
+class Bin:
+    """Intervals, (1, 2) each, rad: of the pitch that the ideal frame shows, of roll and of yaw."""
+
+    pitch: Floats
+    roll: Floats
+    yaw: Floats
+
+    @property
+    def turns(self) -> Turns:
+        """The rotations of its states."""
+        return Turns.of(self.pitch, self.roll, self.yaw)
+
+    def of(self, sets: StateSet) -> StateSet:
+        """The part of the sets that has a pitch of this bin, with its roll and yaw; sets without such a part are left out."""
+        theta = np.stack([np.maximum(sets.theta[:, 0], self.pitch[0, 0]), np.minimum(sets.theta[:, 1], self.pitch[0, 1])], axis=-1)
+        roll, yaw = (np.repeat(side, len(sets), axis=0) for side in (self.roll, self.yaw))
+        return replace(sets, theta=theta, roll=roll, yaw=yaw)[theta[:, 0] <= theta[:, 1]]
+
+
+def bins_of(camera: Camera, attitude: Attitude, pitch: tuple[float, float]) -> Iterator[Bin]:
+    """Bins that cover the attitude at an interval of the pitch that the ideal frame shows."""
+    reach = math.hypot(camera.width, camera.height) / 4  # of a point about whose distance from the centre is in the middle
+    whole = Bin(np.array([pitch]), np.array([attitude.roll]), np.array([attitude.yaw]))
+    middle = whole.yaw.mean() * np.ones((1, 2))
+    by_pitch = Turns.of(whole.pitch, np.zeros((1, 2)), middle)
+    moved_px = 2 * (by_pitch.off_b[0] * camera.focal_u_px + by_pitch.off_a[0] * reach)
+    spans = moved_px, np.ptp(whole.yaw) * camera.focal_u_px, np.ptp(whole.roll) * reach
+    counts = [max(math.ceil(span / BLUR_PX), 1) for span in spans]
+    while math.prod(counts) > MOST_BINS:
+        counts = [max(math.ceil(count / 2), 1) for count in counts]
+    pitches, yaws, rolls = (_cut(side[0], count) for side, count in zip((whole.pitch, whole.yaw, whole.roll), counts, strict=True))
+    return (Bin(one[None], roll[None], yaw[None]) for one in pitches for yaw in yaws for roll in rolls)
+
+
+def _cut(interval: Floats, count: int) -> Floats:
+    """Equal parts of an interval (2,), which share their borders: (count, 2)."""
+    edges = interval[0] + (interval[1] - interval[0]) * (np.arange(count + 1) / count)
+    edges[-1] = interval[1]
+    return np.stack([edges[:-1], edges[1:]], axis=-1)
+
+
+@dataclass(frozen=True)
+class TurnedStart:
+    """What a frame of a rolled or yawed camera leaves of the bank."""
+
+    sensor: Sensor
+    attitude: Attitude
+    lit: Bits
+    """The sensor's frame, (height, width), dilated by the tolerance: what lies beyond it is lit."""
+    parts: tuple[tuple[NDArray[np.uint8], StateSet], ...]
+    """For every bin its painted frame, and the entries that pass there, with its roll and yaw."""
+
+    def left(self, refiner: Refiner, cut: Callable[[StateSet], StateSet] | None, refine: bool) -> StateSet:
+        """What of the entries is consistent with the frame, and with what is known besides, to which `cut` cuts.
+
+        Behind a lens, each bin's entries are refined on its painted frame; else all of them on the sensor's own pixels.
+        """
+        parts = [(frame, sets if cut is None else cut(sets)) for frame, sets in self.parts]
+        together = joined(*(sets for _, sets in parts))
+        if not refine or len(together) == 0:
+            return together
+        if self.sensor.map is not None:
+            return joined(*(_refined_painted(refiner, frame, sets, cut is not None) for frame, sets in parts if len(sets)))
+        together, scene = grouped(together, MOST_ENTRIES), refiner.scene
+        sensor = replace(refiner, extra_budget=-1, window=window_of(scene, together))
+        return sensor.refine(self.lit, together, narrowed=cut is not None)
+
+    def regions(self, left: StateSet, domain: Box, parts: Sequence[NDArray[np.int64]] | None) -> tuple[Box, ...]:
+        """Boxes around parts of what is left, by the camera's pitch; `domain` is of the pitch that the ideal frame shows."""
+        if len(left) == 0:
+            return ()
+        assert left.yaw is not None
+        theta = camera_pitch(left.theta, left.yaw)
+        seen = replace(left, theta=theta, roll=None, yaw=None)
+        return regions_of(seen, domain.replace(theta=(theta[:, 0].min(), theta[:, 1].max())), parts)
+
+    def of(self, sets: StateSet) -> StateSet:
+        """Sets that are known from elsewhere, with the attitude's roll and yaw."""
+        return _with(sets, self.attitude)
+
+    def assumed(self, otherwise: tuple[str, ...]) -> tuple[str, ...]:
+        """What a certificate rests on: the model's assumptions, that of the attitude in the place of none."""
+        return (*attitude_assumptions(self.sensor.scene, str(self.attitude), len(self.parts)), *otherwise[2:])
+
+
+def _refined_painted(refiner: Refiner, frame: NDArray[np.uint8], sets: StateSet, narrowed: bool) -> StateSet:
+    """What of the entries of a bin is consistent with its painted frame, with the bin's roll and yaw."""
+    level = replace(sets, roll=None, yaw=None)
+    left = replace(refiner, extra_budget=-1).refine(frame.view(np.bool_), level, narrowed=narrowed)
+    assert sets.roll is not None
+    assert sets.yaw is not None
+    return replace(left, roll=np.repeat(sets.roll[:1], len(left), axis=0), yaw=np.repeat(sets.yaw[:1], len(left), axis=0))
+
+
+def started(
+    sensor: Sensor,
+    entries: Entries,
+    run: Callable[[NDArray[np.uint8], int], dict[str, Any]],
+    pixels: NDArray[np.uint8],
+    attitude: Attitude,
+    seen: Box | None,
+) -> tuple[dict[str, Any], TurnedStart]:
+    """NN_F's outputs on the painted frames of all bins, taken together, and what of the bank passes.
+
+    `run`: NN_F on a frame, with the budget of missed pixels times a number. `pixels`: the sensor's frame. `seen`: a box that holds the
+    state, with the pitch that the ideal frame shows; None if there is none.
+    """
+    scene = sensor.ideal
+    lit = witnesses(pixels.view(np.bool_), sensor.scene.tolerance.line_px)
+    if seen is None:
+        outputs = run(np.zeros(scene.camera.shape, dtype=np.uint8), 1)
+        return outputs, TurnedStart(sensor, attitude, lit, ((pixels, _with(entries.all[:0], attitude)),))
+    together: dict[str, Any] = {}
+    parts = []
+    for each in bins_of(scene.camera, attitude, (float(seen.lower[0]), float(seen.upper[0]))):
+        turns = each.turns
+        frame = painted(lit, turned_map(sensor, turns))
+        outputs = run(frame, met_by_one(scene, turns))
+        parts.append((frame, each.of(entries.sets(outputs["passes"]))))
+        together = _together(together, outputs)
+    return together, TurnedStart(sensor, attitude, lit, tuple(parts))
+
+
+def turned_map(sensor: Sensor, turns: Turns) -> SensorMap:
+    """The map of a sensor for the rotations of one set."""
+    a, b = ((float(cosine[0]), float(sine[0]), float(off[0])) for cosine, sine, off in _sides(turns))
+    return replace(sensor.still, turn=Turn(a, b))
+
+
+def _sides(turns: Turns) -> tuple[tuple[Floats, Floats, Floats], ...]:
+    return (turns.cos_a, turns.sin_a, turns.off_a), (turns.cos_b, turns.sin_b, turns.off_b)
+
+
+def _with(sets: StateSet, attitude: Attitude) -> StateSet:
+    return replace(sets, **{name: np.tile(getattr(attitude, name), (len(sets), 1)) for name in ("roll", "yaw")})
+
+
+def _together(before: dict[str, Any], outputs: dict[str, Any]) -> dict[str, Any]:
+    """Outputs of NN_F for several bins as of one: what passes in one passes; the state is that of the bin with the most support."""
+    if not before:
+        return dict(outputs)
+    more = outputs["support"].max() > before["support"].max()
+    both = dict(outputs if more else before)
+    both["passes"] = before["passes"] | outputs["passes"]
+    both["support"] = np.maximum(before["support"], outputs["support"])
+    both["mismatch"] = np.minimum(before["mismatch"], outputs["mismatch"])
+    for name in {"filtered", OVERFLOW} & set(both):
+        both[name] = before[name] | outputs[name]
+    return both
+
+
+def grouped(sets: StateSet, most: int) -> StateSet:
+    """At most about so many sets that hold the given ones: hulls of those that differ in x, roll and yaw alone, or in little else.
+
+    Their ends' rows then stay as narrow as those of the entries, which have one pitch, one scale and one distance but for a bin of each.
+    Bins of the scale are doubled until there are few enough.
+    """
+    if len(sets) <= most:
+        return sets
+    pitch, scale = (getattr(sets, name).mean(axis=1) for name in ("theta", "scale"))
+    pitch_step, scale_step = (float(np.median(np.ptp(getattr(sets, name), axis=1))) for name in ("theta", "scale"))
+    distance = np.unique(sets.z, axis=0, return_inverse=True)[1].ravel()
+    place, row_step = np.zeros(len(sets), dtype=np.int64), FIRST_ROW_STEP
+    for _ in range(MOST_DOUBLINGS):
+        keys = np.stack([np.floor(side) for side in (pitch / pitch_step, sets.tangent / row_step, distance, scale / scale_step)], axis=-1)
+        place = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
+        if place.max() < most:
+            break
+        scale_step, row_step = 2 * scale_step, 2 * row_step
+    return hulls_of(sets, place)
+
+
+def hulls_of(sets: StateSet, place: NDArray[np.int64]) -> StateSet:
+    """The hull of the sets at each place, from 0 on without a gap, with its scale at the lowest of their reference rows."""
+    count = int(place.max()) + 1
+    tangent, hulls = np.full(count, -np.inf), {}
+    np.maximum.at(tangent, place, sets.tangent)
+    sets = rereferenced(sets, tangent[place])
+    for name in (*INTERVALS, "roll", "yaw"):
+        side = getattr(sets, name)
+        low, high = np.full(count, np.inf), np.full(count, -np.inf)
+        np.minimum.at(low, place, side[:, 0])
+        np.maximum.at(high, place, side[:, 1])
+        hulls[name] = np.stack([low, high], axis=-1)
+    return StateSet(**hulls, tangent=tangent)
+
+
+def met_by_one(scene: Scene, turns: Turns) -> int:
+    """Most pixels of the ideal frame that all markings together can meet inside what one pixel of the sensor shows.
+
+    With S' = cos(a) S + sin(a) T, d(X/Z)/dS' = 1/Z^2 and d(Y/Z) = dT'/Z - Y sin(b) dS'/Z^2. What spans w px meets at most floor(w) + 2
+    columns or rows, and a straight line in so many columns and rows one pixel fewer than they are together.
+    """
+    camera = scene.camera
+    cos_a, sin_a, sin_b = (float(np.abs(side[0])) + float(off[0]) for side, off in _sizes(turns))
+    sides = np.abs([camera.u0, camera.width - camera.u0]).max() / camera.focal_u_px
+    heights = np.abs([camera.v0, camera.height - camera.v0]).max() / camera.focal_v_px
+    aside, down = cos_a * sides + sin_a * heights, cos_a * heights + sin_a * sides
+    ahead = float(turns.cos_b[0] - turns.off_b[0]) - sin_b * aside
+    if ahead <= 0:
+        return camera.width * camera.height
+    across, fall = cos_a / camera.focal_u_px + sin_a / camera.focal_v_px, cos_a / camera.focal_v_px + sin_a / camera.focal_u_px
+    spans = camera.focal_u_px * across / ahead**2, camera.focal_v_px * (fall / ahead + down * sin_b * across / ahead**2)
+    columns, rows = (math.floor(span * (1 + 2.0**-30)) + 2 for span in spans)
+    return min(columns * rows, len(scene.runway.markings) * (columns + rows - 1))
+
+
+def _sizes(turns: Turns) -> tuple[tuple[Floats, Floats], ...]:
+    return (turns.cos_a, turns.off_a), (turns.sin_a, turns.off_a), (turns.sin_b, turns.off_b)
+
+
+def window_of(scene: Scene, sets: StateSet) -> tuple[slice, slice]:
+    """The rows and columns of the sensor that show what the sets may show, with a margin of `BEYOND_PX`."""
+    camera = scene.camera
+    borders = SensorBorders.of(
+        scene, sets, LitPixels.of(np.zeros(camera.shape, dtype=bool), (slice(0, camera.height), slice(0, camera.width)), True)
+    )
+    low, high = borders.columns
+    sides = (
+        (min(borders.far[0].min(), borders.near[0].min()), max(borders.far[1].max(), borders.near[1].max()), camera.height),
+        (low.min(), high.max(), camera.width),
+    )
+    rows, columns = (
+        slice(int(np.clip(np.floor(first) - BEYOND_PX, 0, size - 1)), int(np.clip(np.floor(last) + 1 + BEYOND_PX, 1, size)))
+        for first, last, size in sides
+    )
+    return rows, columns
+
+
+def seen_box(box: Box, attitude: Attitude) -> Box:
+    """A box of the camera's states with the pitch that the ideal frame may show of them."""
+    low, high = seen_pitch(np.array([[box.lower[0], box.upper[0]]]), np.array([attitude.yaw]))[0]
+    return box.replace(theta=(low, high))
+
+
+def hull_of(sets: StateSet) -> Box:
+    """The box around all sets."""
+    return Box(sets.lower.min(axis=0), sets.upper.max(axis=0))
