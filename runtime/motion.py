@@ -35,7 +35,7 @@ SHORTEST_US = 1e-6
 LATEST_US = 2**63
 """Instants lie before this one, and after its negative: 300,000 years."""
 STEEPEST_RAD = 1.57
-"""Pitches of a domain lie within right angles; one that may have moved beyond is no state of it."""
+"""Where a pitch is taken for a right angle."""
 FLAT = 1e-9
 """A slope in delta of no more than so much of its terms counts as both up and down: far above float64's error, and sound either way."""
 
@@ -153,8 +153,11 @@ def with_pitches(sets: StateSet, by: Displacement, yaw_before: tuple[float, floa
     pitch = camera_pitch(sets.theta, before)
     ahead = lead(sets.theta, pitch, before)
     low, high = pitch[:, 0] + by.lower[0], pitch[:, 1] + by.upper[0]
-    pitch = np.clip(np.stack([lowered(low, np.abs(low)), raised(high, np.abs(high))], axis=-1), -STEEPEST_RAD, STEEPEST_RAD)
+    moved_to = np.stack([lowered(low, np.abs(low)), raised(high, np.abs(high))], axis=-1)
+    pitch = np.clip(moved_to, -STEEPEST_RAD, STEEPEST_RAD)
     behind = lead(seen_pitch(pitch, after), pitch, after)
+    beyond = np.logical_or.reduce(np.abs(moved_to) > STEEPEST_RAD, axis=1)  # towards a right angle c - theta falls to 0
+    behind = np.where(beyond[:, None], np.stack([np.minimum(behind[:, 0], 0), np.maximum(behind[:, 1], 0)], axis=-1), behind)
     lower, upper = (np.tile(side, (len(sets), 1)) for side in (by.lower, by.upper))
     terms = np.abs(ahead).max(axis=1) + np.abs(behind).max(axis=1)
     lower[:, 0] += lowered(behind[:, 0] - ahead[:, 1], terms)

@@ -22,6 +22,7 @@ from runtime.attitude import Attitude, Turns, camera_pitch, seen_pitch
 from runtime.estimate import Box
 from runtime.model.entries import Entries
 from runtime.model.format import OVERFLOW
+from runtime.motion import STEEPEST_RAD
 from runtime.painting import painted
 from runtime.refine.lit_pixels import LitPixels
 from runtime.refine.refiner import Refiner, joined
@@ -283,8 +284,10 @@ def window_of(scene: Scene, sets: StateSet) -> tuple[slice, slice]:
 
 def seen_box(box: Box, attitude: Attitude) -> Box:
     """A box of the camera's states with the pitch that the ideal frame may show of them."""
-    low, high = seen_pitch(np.array([[box.lower[0], box.upper[0]]]), np.array([attitude.yaw]))[0]
-    return box.replace(theta=(low, high))
+    theta = np.array([[box.lower[0], box.upper[0]]])
+    low, high = seen_pitch(np.clip(theta, -STEEPEST_RAD, STEEPEST_RAD), np.array([attitude.yaw]))[0]
+    below, above = theta[0] < -STEEPEST_RAD, theta[0] > STEEPEST_RAD  # all that a pitch of the ideal frame can be, then
+    return box.replace(theta=(-math.pi / 2 if below[0] else low, math.pi / 2 if above[1] else high))
 
 
 def hull_of(sets: StateSet) -> Box:

@@ -19,7 +19,7 @@ from flights.sound import SoundFlight
 from random_scenes.outcomes import Outcomes
 from typer.testing import CliRunner
 
-from runtime import Box, Tracker, estimator
+from runtime import Box, Tracker, estimator, tracker
 
 MODEL = str(Path(__file__).parents[1] / "models" / "paper.onnx")
 

@@ -174,6 +174,12 @@ def test_wrong_attitudes_and_empty_frames(paper: Estimator) -> None:
     assert paper.estimate(frame, attitude=Attitude(-0.3, 0.2)).outcome is Outcome.NO_RUNWAY
     far = paper.domain.replace(theta=(0.72, 0.74))
     assert paper.estimate(frame, attitude=attitude, prior=far).outcome is Outcome.INCONSISTENT
+    anything = Box(PAPER.domain.lower - 10, PAPER.domain.upper + 10)
+    told, alone = paper.estimate(frame, attitude=attitude, prior=anything).box, paper.estimate(frame, attitude=attitude).box
+    assert told is not None
+    assert alone is not None
+    assert (told.lower == alone.lower).all()
+    assert (told.upper == alone.upper).all()
     outside = Box(PAPER.domain.lower - 1, PAPER.domain.lower - 0.5)
     assert paper.estimate(frame, attitude=attitude, prior=outside).outcome is Outcome.INCONSISTENT
 
