@@ -199,7 +199,7 @@ def test_ctrl_c_leaves_the_old_model(run: Run, scene_file: Path, tmp_path: Path,
         threading.Timer({seconds}, os.kill, (os.getpid(), signal.SIGINT)).start()
         {COMMAND}
     """)
-    result = run(scene_file.name, "-o", "model.onnx", "--jobs", 1, code=interrupted)
+    result = run(scene_file.name, "-o", "model.onnx", "--jobs", 1, "--memory-mb", 10**6, code=interrupted)
     fails_with(result, "model.onnx: interrupted; the model that was there before is untouched", code=130)
     assert (tmp_path / "model.onnx").read_bytes() == b"old"
     assert models_in(tmp_path) == {"model.onnx"}
@@ -229,8 +229,8 @@ def test_a_build_of_more_memory_than_it_may_take_is_one_line(run: Run, scene_fil
         result = run(scene_file.name, "--memory-mb", 200, *also)
         assert "memory that it may take" in result.stdout
         fails_with(result, "--memory-mb: found 200; give ", "or more, or fewer --jobs")
-    scene_file.write_text(ONE_CELL.replace("x_m = { centres = [0.0], width = 0.0 }", "x_m = { centres = [0.0], width = 40.0 }"))
-    fails_with(run(scene_file.name, "--memory-mb", 2000, "--jobs", 1), "domain.x_m: x spans 40 m", "narrow it to about")
+    scene_file.write_text(ONE_CELL.replace("x_m = { centres = [0.0], width = 0.0 }", "x_m = { centres = [0.0], width = 1.2 }"))
+    fails_with(run(scene_file.name, "--memory-mb", 700, "--jobs", 1), "domain.x_m: x spans 1.2 m", "narrow it to about")
     assert models_in(tmp_path) == set()
 
 
