@@ -203,9 +203,14 @@ def group_boxes(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.floa
     return LineBoxes(sides[:, :, 0], sides[:, :, 1], np.array([row for *_, row in boxes]))
 
 
-def group_count(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> int:
-    """Number of the cell's `group_boxes`, without making them."""
-    return sum(len(lateral) * len(scales) for _, _, _, lateral, scales in _columns_of_boxes(scene, lower, upper))
+def group_count(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64], most: int = MOST_GROUPS) -> int:
+    """Number of the cell's `group_boxes`, without making them; any number above `most` if they are more."""
+    count = 0
+    for _, _, _, lateral, scales in _columns_of_boxes(scene, lower, upper):
+        count += len(lateral) * len(scales)
+        if count > most:
+            break
+    return count
 
 
 def _columns_of_boxes(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> Iterator[tuple[Any, Any, float, Any, Any]]:

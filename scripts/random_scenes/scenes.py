@@ -15,7 +15,7 @@ import numpy as np
 
 from build_model.calibration import displacement_px
 from build_model.pixel_mask import Window
-from build_model.window_bank import group_boxes
+from build_model.window_bank import group_count
 from random_scenes.divisions import EQUAL, Division, draw_division, stretch_of
 from random_scenes.sights import PLACES, Floats, Rng, Sight, UndrawableError, draw_camera, mirrored
 from runtime.camera import ground_scale, project, row_of_point
@@ -34,7 +34,7 @@ MOST_ROWS = 1.5e7
 WINDOWED_SHARE = 1 / 3
 """Share of the scenes that have a bank of windows."""
 MOST_GROUPS = 600
-"""Limit on its groups: a second or two."""
+"""Limit on its groups, the same share of it for each cell: a second or two."""
 MANY_BINS, FEW_BINS = (6, 9, 20, 5), (2, 2, 5, 3)
 """Bins of theta, x, scale and z stay below these."""
 ENOUGH_BINS = 8
@@ -336,7 +336,8 @@ def in_windows(rng: Rng, scene: Scene, sight: Sight, plan: Plan, setting: Settin
         try:
             wide = replace(setting.scene(sight, replace(plan, steps=plan.steps * factor), scene.tolerance), bank=bank)
             lower, upper = wide.domain.cells()
-            if sum(len(group_boxes(wide, *cell)) for cell in zip(lower, upper, strict=True)) <= MOST_GROUPS:
+            most = MOST_GROUPS // len(lower)
+            if all(group_count(wide, *cell, most) <= most for cell in zip(lower, upper, strict=True)):
                 return wide
         except SceneError:
             continue
