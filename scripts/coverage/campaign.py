@@ -29,7 +29,7 @@ from coverage.journal import ResultJournal
 from coverage.judge import HALF_WIDTHS, Tally, Violation, quantile
 from coverage.models import DERIVED, build_model
 from coverage.scenarios import Scenario, scenarios
-from runtime import Estimator, terminal
+from runtime import Estimator, Scene, SceneError, terminal
 from runtime.whole_file import write_whole
 
 CHUNK = 250
@@ -146,6 +146,17 @@ def replay(chunk: Chunk) -> int:
     return len(violations)
 
 
+def derived_models(scene: Scene, wanted: set[str], folder: Path, jobs: int) -> dict[str, Path]:
+    """Those of `DERIVED` that scenarios ask for. One that has no certificate, as where too little is left in view, is told and left out."""
+    models = {}
+    for name in track([name for name in DERIVED if name in wanted], "models", console=terminal.console(stderr=True)):
+        try:
+            models[name] = build_model(scene, name, folder, jobs)
+        except SceneError as error:
+            print(f"left out, with its scenarios: the model {name!r}, which this scene has none of ({error})", file=sys.stderr)
+    return models
+
+
 def main(
     model: Annotated[Path, typer.Argument(help="Model to test.")] = Path("models/paper.onnx"),
     frames: Annotated[int, typer.Option(min=1, help="Frames a scenario.")] = 2000,
@@ -167,11 +178,8 @@ def main(
         sys.exit(int(replay(Chunk(scenario, str(path), None if recording is None else str(recording), seed, number, 1, "")) > 0))
     if only:
         chosen = [scenario_named(name, chosen) for name in dict.fromkeys(only)]
-    models = {"given": model}
-    for name in track(
-        [name for name in DERIVED if name in {scenario.model for scenario in chosen}], "models", console=terminal.console(stderr=True)
-    ):
-        models[name] = build_model(given.scene, name, output.parent, jobs)
+    models = {"given": model} | derived_models(given.scene, {scenario.model for scenario in chosen}, output.parent, jobs)
+    chosen = [scenario for scenario in chosen if scenario.model in models]
     chunks = chunks_of(models, chosen, frames, recording, seed)
     journal = Journal(output.with_suffix(".chunks.jsonl"), chunks)
     try:

@@ -47,14 +47,14 @@ UNTRAINED = EstimatorTraining(training_frames=256, epochs=1)
 
 def derived_scene(scene: Scene, name: str) -> Scene:
     """The scene of one of `DERIVED`."""
-    exact = replace(scene, estimator=UNTRAINED, calibration=Calibration(), tolerance=Tolerance())
+    exact = replace(scene, estimator=UNTRAINED, calibration=Calibration(), tolerance=Tolerance(missed_budget=scene.tolerance.missed_budget))
     if name == "tolerant":
-        return replace(exact, calibration=off_by_a_pixel(exact), tolerance=Tolerance(line_px=1))
+        return replace(exact, calibration=off_by_a_pixel(exact), tolerance=replace(exact.tolerance, line_px=1))
     if name in LENSES:
         return seen_through(exact, name)
     side, _, also = name.removeprefix("cut ").partition(", ")
     cut = staggered_scene(exact, above=name == BARELY[0]) if name in BARELY else cut_scene(exact, side)
-    return replace(cut, calibration=SHIFTED, tolerance=Tolerance(line_px=1)) if also or name in BARELY else cut
+    return replace(cut, calibration=SHIFTED, tolerance=replace(exact.tolerance, line_px=1)) if also or name in BARELY else cut
 
 
 def off_by_a_pixel(scene: Scene) -> Calibration:
