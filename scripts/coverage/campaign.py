@@ -157,6 +157,15 @@ def derived_models(scene: Scene, wanted: set[str], folder: Path, jobs: int) -> d
     return models
 
 
+def is_allowed(scenario: Scenario, model: Path) -> bool:
+    """True if the model's entries are strong enough for all pixels that are missed in the scenario; else it is told."""
+    largest = Estimator.load(model).largest_missed_budget
+    if max(scenario.missed, default=0) <= largest:
+        return True
+    print(f"left out: {scenario.name!r} misses up to {max(scenario.missed)} pixels, {model.name} takes {largest} at most", file=sys.stderr)
+    return False
+
+
 def main(
     model: Annotated[Path, typer.Argument(help="Model to test.")] = Path("models/paper.onnx"),
     frames: Annotated[int, typer.Option(min=1, help="Frames a scenario.")] = 2000,
@@ -179,7 +188,7 @@ def main(
     if only:
         chosen = [scenario_named(name, chosen) for name in dict.fromkeys(only)]
     models = {"given": model} | derived_models(given.scene, {scenario.model for scenario in chosen}, output.parent, jobs)
-    chosen = [scenario for scenario in chosen if scenario.model in models]
+    chosen = [scenario for scenario in chosen if scenario.model in models and is_allowed(scenario, models[scenario.model])]
     chunks = chunks_of(models, chosen, frames, recording, seed)
     journal = Journal(output.with_suffix(".chunks.jsonl"), chunks)
     try:
