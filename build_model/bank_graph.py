@@ -52,6 +52,14 @@ def window_of_frame(g: GraphWriter, tables: BankTables) -> str:
     return g.node("Slice", "crop", FRAME, first, stop, "rows_and_columns")
 
 
+def witnesses(g: GraphWriter, crop: str, tolerance: int) -> str:
+    """The window's part of the frame dilated by a tolerance, px, of 1 or more."""
+    g.whole("image_axes", 0, 1)
+    image = g.node("Unsqueeze", "crop_image", crop, "image_axes")
+    dilated = g.node("MaxPool", "dilated_image", image, kernel_shape=[2 * tolerance + 1] * 2, pads=[tolerance] * 4, strides=[1, 1])
+    return g.node("Squeeze", "witnesses", dilated, "image_axes")
+
+
 def decide(g: GraphWriter, scene: Scene, tables: BankTables, missed: str, extra: str) -> None:
     """support, mismatch, cell and the hulls; `passing` (cells,) bool stays for what follows."""
     g.whole("last_axis", -1)

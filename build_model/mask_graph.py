@@ -12,7 +12,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto
 
-from build_model.bank_graph import BIT, GraphWriter, decide, finished, framed, shown_cells, window_of_frame
+from build_model.bank_graph import BIT, GraphWriter, decide, finished, framed, shown_cells, window_of_frame, witnesses
 from build_model.filter_tables import FilterTables
 from runtime.scene import Scene
 
@@ -40,11 +40,7 @@ def _column_sums(g: GraphWriter, scene: Scene, tables: FilterTables) -> tuple[st
     sums = _sums(g, "frame", tables, crop)
     if tolerance == 0:
         return crop, sums
-    g.whole("image_axes", 0, 1)
-    image = g.node("Unsqueeze", "crop_image", crop, "image_axes")
-    dilated = g.node("MaxPool", "dilated_image", image, kernel_shape=[2 * tolerance + 1] * 2, pads=[tolerance] * 4, strides=[1, 1])
-    witnesses = g.node("Squeeze", "witnesses", dilated, "image_axes")
-    return crop, g.node("Concat", "all_sums", sums, _sums(g, "witness", tables, witnesses), axis=0)
+    return crop, g.node("Concat", "all_sums", sums, _sums(g, "witness", tables, witnesses(g, crop, tolerance)), axis=0)
 
 
 def _sums(g: GraphWriter, name: str, tables: FilterTables, pixels: str) -> str:

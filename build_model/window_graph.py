@@ -14,7 +14,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper
 
-from build_model.bank_graph import BIT, GraphWriter, decide, finished, framed, shown_cells, window_of_frame
+from build_model.bank_graph import BIT, GraphWriter, decide, finished, framed, shown_cells, window_of_frame, witnesses
 from build_model.filter_tables import WindowTables
 from runtime.model.format import OVERFLOW, PADDING_SIZE
 from runtime.scene import Scene, WindowedBank
@@ -42,10 +42,7 @@ def _row_sums(g: GraphWriter, scene: Scene, tables: WindowTables, crop: str) -> 
     g.constant("along", np.array(0, dtype=np.int64))
     g.whole("flat", -1)
     if tolerance:
-        g.whole("image_axes", 0, 1)
-        image = g.node("Unsqueeze", "crop_image", crop, "image_axes")
-        dilated = g.node("MaxPool", "dilated_image", image, kernel_shape=[2 * tolerance + 1] * 2, pads=[tolerance] * 4, strides=[1, 1])
-        crop = g.node("Squeeze", "witnesses", dilated, "image_axes")
+        crop = witnesses(g, crop, tolerance)
     turned = g.node("Pad", "turned_padded", g.node("Transpose", "turned", _both_sides(g, tables, crop), perm=[1, 0]), "column_of_zeros")
     counted = g.node("Cast", "turned_counted", turned, to=TensorProto.INT32)
     return g.node("Reshape", "sums", g.node("CumSum", "row_sums", counted, "along"), "flat")
