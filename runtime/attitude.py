@@ -182,6 +182,12 @@ class Turns:
         (cos_b, sin_b0), off_b = _middle(b, np.abs(b[0]) + np.abs(b[1]))
         return Turns(cos_a, sin_a, cos_b, sin_b0, off_a, off_b)
 
+    @staticmethod
+    def none(count: int) -> Turns:
+        """Of `count` sets whose sensor is not turned."""
+        one, nothing = np.ones(count), np.zeros(count)
+        return Turns(one, nothing, one, nothing, nothing, nothing)
+
     @property
     def off(self) -> Floats:
         """The largest angle between one of a set's rotations and the one in the middle."""
