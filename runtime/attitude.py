@@ -183,10 +183,10 @@ class Turns:
         return Turns(cos_a, sin_a, cos_b, sin_b0, off_a, off_b)
 
     @staticmethod
-    def none(count: int) -> Turns:
-        """Of `count` sets whose sensor is not turned."""
+    def level(count: int, off_a: float, off_b: float) -> Turns:
+        """Of `count` sets whose sensor is not turned, but for so much at most."""
         one, nothing = np.ones(count), np.zeros(count)
-        return Turns(one, nothing, one, nothing, nothing, nothing)
+        return Turns(one, nothing, one, nothing, np.full(count, off_a), np.full(count, off_b))
 
     @property
     def off(self) -> Floats:

@@ -11,6 +11,7 @@ is left of the entries within a box that is known to hold the state.
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -113,6 +114,11 @@ class Estimator:
     def extra_budget(self) -> int:
         """e of Theorem B, or -1 where it is not used."""
         return int(self._budgets["extra_budget"])
+
+    @property
+    def beside_px(self) -> int:
+        """How far beside its place a pixel may fire: `line_px`, less the whole pixels of it that NN_F needs for the calibration."""
+        return max(self.scene.tolerance.line_px - math.ceil(self.metadata.get("calibration_shift_px", 0.0)), 0)
 
     @property
     def largest_missed_budget(self) -> int:
@@ -236,10 +242,10 @@ class Estimator:
         cut = None if known is None else partial(within, self.ideal.camera, known=known)
         if found.turned is not None:
             return found.turned.left(self._sensor_refiner, cut, refine)
-        if self.sensor.map is not None:
+        if self.sensor.optics is not None:
             entries = self._entries.sets(found.passes)
             entries = entries if cut is None else cut(entries)
-            lit = witnesses(found.pixels.view(np.bool_), self.scene.tolerance.line_px)
+            lit = witnesses(found.pixels.view(np.bool_), self.beside_px)
             return refined(self._sensor_refiner, lit, entries, cut is not None) if refine else entries
         frame, line_px = found.pixels.view(np.bool_), self.ideal.tolerance.line_px
         if refine and self._refiner.extra_budget >= 0 and line_px == 0:  # Theorem B's claims are made at tolerance 0 only

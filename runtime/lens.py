@@ -182,6 +182,12 @@ class Lens:
         return float(self.stretches[: max(int(np.searchsorted(self.bounds.edges, radius)), 1)].min())
 
     @cached_property
+    def largest_scale(self) -> float:
+        """A bound above |D(x)|/|x| and the Jacobian's eigenvalues on the disc."""
+        largest = max(float(self.bounds.across[1].max()), float(self.bounds.along[1].max()))
+        return (largest + 6 * self._tangential_size * self.radius) * (1 + ROUNDING_SHARE)
+
+    @cached_property
     def rounding(self) -> float:
         """What `distorted` is off by at most, in both coordinates together, on the disc."""
         r = self.radius

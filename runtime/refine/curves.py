@@ -75,7 +75,7 @@ class Curves:
         s, half = (low + high) / 2, ((high - low) / 2 + self.margin) * (1 + ROUNDING_SHARE)
         _, mixed, _, off = self.optics.derivatives(s, t, half)
         shown = self.optics.lens.distorted(s, t)[1]
-        miss = np.abs(shown - border) + (np.abs(mixed) + off) * half + self._rounding(border)
+        miss = np.abs(shown - border) + (np.abs(mixed) + off) * half + self.optics.border(border) + self._rounding(border)
         reach = miss / self.rise[:, None] * (1 + ROUNDED_DERIVATIVE)
         (first_low, first_high), first_known = self.lines.at(t - reach)
         (last_low, last_high), last_known = self.lines.at(t + reach)

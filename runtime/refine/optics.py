@@ -5,15 +5,19 @@ Distances here are in units of the focal lengths: a point of the sensor in colum
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.lens import Lens
+from runtime.attitude import Turns
+from runtime.lens import LARGEST_RADIUS, Lens
 from runtime.refine.interval import Bits, Floats
+from runtime.rounding import ROUNDING_SHARE
 from runtime.scene import Calibration, Camera, Scene
-from runtime.sensor_map import SensorMap
+from runtime.sensor_map import corner_rays, lens_of
 
 ROUNDED_DERIVATIVE = 2.0**-30
 """Covers what rounding does to a lens's derivatives."""
@@ -45,20 +49,66 @@ class Optics:
     lens: Lens
     corners: tuple[Floats, Floats, Floats]
     """S and T of each corner, and how far from it the true ray is at most; infinite where it is not known."""
+    calibration: Calibration
+    """What the sensor may be off by: these are of the one in the middle."""
     way: Floats
     """Bound on the way in rays from the first corner of a row to each, along the border."""
 
     @staticmethod
     def of(scene: Scene) -> Optics | None:
-        """The optics of a scene's sensor; None for a pinhole. Raises `SceneError` for a lens that folds within the frame."""
-        if scene.camera.pinhole:
+        """The optics of a scene's sensor; None for a pinhole that is known exactly.
+
+        Raises `SceneError` for a lens that folds within the frame.
+        """
+        camera, off = scene.camera, scene.calibration
+        if camera.pinhole and off.exact:
             return None
-        still = SensorMap.of(replace(scene, calibration=Calibration()))
-        s, t, off = still.rays
-        a_pixel = 1 / scene.camera.focal_u_px * (1 + ROUNDED_DERIVATIVE)
-        steps = a_pixel / still.lens.stretches_around(np.sqrt(s * s + t * t), a_pixel / still.lens.stretch)
+        lens = lens_of(camera, off)
+        if lens.model is None:
+            lens = replace(lens, radius=LARGEST_RADIUS)
+        s, t, away = corner_rays(camera, lens)
+        a_pixel = 1 / camera.focal_u_px * (1 + ROUNDED_DERIVATIVE)
+        steps = a_pixel / lens.stretches_around(np.sqrt(s * s + t * t), a_pixel / lens.stretch)
         way = np.cumsum(np.pad(steps[:, :-1], ((0, 0), (1, 0))), axis=1)
-        return Optics(scene.camera, still.lens, (s.ravel(), t.ravel(), off.ravel()), way.ravel())
+        return Optics(camera, lens, (s.ravel(), t.ravel(), away.ravel()), off, way.ravel())
+
+    @cached_property
+    def swings(self) -> tuple[float, float, float]:
+        """How far g, Q_u and Q_v may be from 0 (`runtime.refine.unknowns`)."""
+        off, camera = self.calibration, self.camera
+        zoom = (1 + ROUNDING_SHARE) / (1 - off.focal_relative)
+        return off.focal_relative * zoom, off.principal_px / camera.focal_u_px * zoom, off.principal_px / camera.focal_v_px * zoom
+
+    def level_turns(self, count: int) -> Turns:
+        """The rotations of sets of which no attitude is told."""
+        return Turns.level(count, self.calibration.roll_rad, self.calibration.yaw_rad)
+
+    def off(self, turns: Turns) -> tuple[Floats, ...]:
+        """How far a, b, g, Q_u and Q_v may be from their middles, (sets,) or (1,) each."""
+        return turns.off_a, turns.off_b, *(np.full(1, side) for side in self.swings)
+
+    def moved(self, s: Floats, t: Floats, reach: Floats) -> Floats:
+        """How far the calibration's plus-minus may move the rays within `reach` of these, their places in the frame given."""
+        zoom, across, down = self.swings
+        if zoom == across == down == 0:
+            return np.zeros(1)
+        radius = np.sqrt(s * s + t * t)
+        shown = zoom * (radius + reach) * self.lens.largest_scale + math.hypot(across, down)
+        around = float(np.max(reach + shown / self.lens.stretch, initial=0.0))
+        return shown / self.lens.stretches_around(radius, around) * (1 + ROUNDED_DERIVATIVE)
+
+    def known(self, turns: Turns) -> bool:
+        """True where nothing is unknown of a camera."""
+        return not (max(self.swings) > 0 or (turns.off > 0).any())
+
+    def border(self, border: Floats) -> Floats:
+        """How far from a border's own row, in focal lengths, the lens may show it."""
+        zoom, _, down = self.swings
+        return np.abs(border) * zoom + down
+
+    def beside_px(self, shown: Floats, focal_px: float) -> Floats:
+        """How far, px, what is shown at some focal lengths from the axis may be from there in the frame."""
+        return self.calibration.principal_px + np.abs(shown) * (self.calibration.focal_relative * focal_px)
 
     def between(self, first: Floats, last: Floats, row: Floats) -> Stretch:
         """Of the border between two columns, of one shape; `row` is of that shape, or its last axes."""

@@ -32,7 +32,8 @@ from runtime.refine.borders import across, ends_in_rows
 from runtime.refine.curves import Curves, Met, shown_rows
 from runtime.refine.interval import Bits, Floats, Interval
 from runtime.refine.lit_pixels import LitPixels
-from runtime.refine.optics import Optics
+from runtime.refine.optics import Optics, Stretch
+from runtime.refine.unknowns import Derivatives, Unknowns
 from runtime.refine.view import LEAST_DEPTH, ROUNDED_SWAY, Lines, Sway, View
 from runtime.rounding import ROUNDING_SHARE, above, below, column_margin_px, lowered, raised
 from runtime.scene import Camera, Scene
@@ -67,7 +68,9 @@ class SensorBorders:
     """How the offset of p* sways, (1, 1, sets)."""
 
     met: Met | None = None
-    """Behind a lens: where in rays the markings may meet the borders."""
+    """Behind a lens, or of a camera that may be off: where in rays the markings may meet the borders."""
+    unknowns: Unknowns | None = None
+    """There: what may be off, where something may."""
 
     @staticmethod
     def of(scene: Scene, sets: StateSet, pixels: LitPixels, optics: Optics | None = None) -> SensorBorders:
@@ -78,11 +81,12 @@ class SensorBorders:
         view, offset = View.of(scene.camera, sets, optics), _offset_range(scene, sets)
         margin_px = _column_margins_px(scene, sets, offset, pixels)
         ideal_near, ideal_far = ends_in_rows(scene, sets)
-        lines, curves = Lines.of(scene.camera, view, offset), None
+        lines, curves, unknowns = Lines.of(scene.camera, view, offset), None, None
         if optics is None:
             near, far = (_rays_of_ends(scene.camera, sets, view, offset, rows, margin_px).rows for rows in (ideal_near, ideal_far))
         else:
-            near, far, curves = _ends_behind_lens(scene.camera, sets, view, offset, (ideal_near, ideal_far), margin_px, lines)
+            near, far, curves, points = _ends_behind_lens(scene, sets, view, offset, (ideal_near, ideal_far), margin_px, lines)
+            unknowns = None if optics.known(view.turns) else Unknowns.of(view, optics, points)
         first, last = (
             np.minimum(np.maximum(np.floor(row), pixels.top), pixels.bottom)
             for row in (np.minimum.reduce([*far[0], *near[0]], axis=0), np.maximum.reduce([*near[1], *far[1]], axis=0))
@@ -92,9 +96,13 @@ class SensorBorders:
         crossed &= row < near[0][:, None]
         tangent = tangent_of_row(scene.camera, row)
         met = None if curves is None else curves.met(tangent)
-        columns = _as_columns(scene.camera, *(lines.at(tangent) if met is None else (met.shown, met.known)), margin_px)
+        if met is None or optics is None:
+            columns = _as_columns(scene.camera, *lines.at(tangent), margin_px)
+        else:
+            beside_px = optics.beside_px(np.maximum(np.abs(met.shown[0]), np.abs(met.shown[1])), scene.camera.focal_u_px)
+            columns = _as_columns(scene.camera, met.shown, met.known, margin_px + beside_px)
         point = view.sway(*_middle_point(scene.camera, sets, view, offset, ideal_near, ideal_far), np.zeros(1))
-        return SensorBorders(row, near, far, ideal_near, ideal_far, crossed, columns, margin_px, view, point, met)
+        return SensorBorders(row, near, far, ideal_near, ideal_far, crossed, columns, margin_px, view, point, met, unknowns)
 
     def offsets(self, scene: Scene, first: Floats, last: Floats, rows: slice = slice(None)) -> Interval:
         """Bounds on (p_x - x'') scale of markings that cross the borders `rows` in the closed columns `first` to `last`; of that shape.
@@ -117,14 +125,30 @@ class SensorBorders:
         return _bounds_where(seen & rises, first > last, low, high)
 
     def _offsets_behind_lens(self, optics: Optics, first: Floats, last: Floats, row: Floats) -> Interval:
-        """`offsets` by the rays of the corners of pixels."""
-        camera, view = optics.camera, self.view
+        """`offsets` by the rays of the corners of pixels, of a camera that is known exactly."""
         stretch = optics.between(first, last + 1, row)
-        margin = self.margin_px / camera.focal_u_px + stretch.off
-        sway = view.sway(*stretch.middle, stretch.reach).beside(self.point, camera, view) if view.swaying else 0.0
-        low = view.quotient(*stretch.left, -margin, np.minimum, stretch.off) * camera.focal_u_px - sway
-        high = view.quotient(*stretch.right, margin, np.maximum, stretch.off) * camera.focal_u_px + sway
-        return _bounds_where(stretch.known & view.rises_along(optics, stretch), first > last, low, high)
+        low, high = self._quotients(optics, stretch)
+        return _bounds_where(stretch.known & self.view.rises_along(optics, stretch), first > last, low, high)
+
+    def sheared_offsets(self, first: Floats, last: Floats, rows: slice = slice(None)) -> tuple[Floats, Floats, Floats]:
+        """Bounds on (p_x - x'') scale'' - kappa w of such markings, and w, where something is unknown of the camera (`unknowns`)."""
+        view, unknowns, row = self.view, self.unknowns, self.row[rows]
+        optics = view.optics
+        assert optics is not None
+        assert unknowns is not None
+        stretch = optics.between(first, last + 1, row)
+        derivatives = Derivatives.at(view, optics, *stretch.middle, stretch.reach)
+        rest, (low, high) = unknowns.rest_px(derivatives), self._quotients(optics, stretch)
+        known = stretch.known & view.rises_along(optics, stretch) & np.isfinite(rest)
+        w = np.where(known, derivatives.w.middle - unknowns.w, 0.0)
+        return *_bounds_where(known, first > last, low - rest, high + rest), w
+
+    def _quotients(self, optics: Optics, stretch: Stretch) -> Interval:
+        """The smallest and the largest F s X/D at the ends of stretches."""
+        focal = optics.camera.focal_u_px
+        margin = self.margin_px / focal + stretch.off
+        low = self.view.quotient(*stretch.left, -margin, np.minimum, stretch.off) * focal
+        return low, self.view.quotient(*stretch.right, margin, np.maximum, stretch.off) * focal
 
     def seen_x(self, sets: StateSet) -> Interval:
         """Range of x'', to which offsets refer, (sets,), m."""
@@ -259,14 +283,16 @@ def _rays_of_ends(camera: Camera, sets: StateSet, view: View, offset: Interval, 
 
 
 def _ends_behind_lens(
-    camera: Camera, sets: StateSet, view: View, offset: Interval, ends: tuple[Interval, Interval], margin_px: Floats, lines: Lines
-) -> tuple[Interval, Interval, Curves]:
-    """Ranges of the sensor's rows of near and far ends, and the curves between them; no bounds where those may not be met once only.
+    scene: Scene, sets: StateSet, view: View, offset: Interval, ends: tuple[Interval, Interval], margin_px: Floats, lines: Lines
+) -> tuple[Interval, Interval, Curves, tuple[Floats, Floats]]:
+    """Ranges of the sensor's rows of near and far ends, the curves between them, and about the rays of four ends, (4, sets) each.
+
+    There are no bounds where the curves may not be met once only.
 
     What lies beyond the lens's disc is cut off. An end that may lie there has no bound beyond, and as its other bound that of a point of
     the marking which lies within.
     """
-    optics = view.optics
+    optics, camera = view.optics, scene.camera
     assert optics is not None
     (near_low, near_high), (far_low, far_high) = ends
     top, bottom = _rows_within_disc(camera, sets, optics, offset)
@@ -276,14 +302,20 @@ def _ends_behind_lens(
     rays = _rays_of_ends(camera, sets, view, offset, (rows, rows), margin_px)
     (low, high), known = shown_rows(optics, rays.s, rays.t)
     curves = Curves.of(optics, lines, rays.t[0][2], rays.t[1][1], margin_px / camera.focal_u_px)
-    low, high = (camera.v0 + camera.focal_v_px * side for side in (low, high))
+    beside_px = optics.beside_px(np.maximum(np.abs(low), np.abs(high)), camera.focal_v_px)
+    low, high = camera.v0 + camera.focal_v_px * low - beside_px, camera.v0 + camera.focal_v_px * high + beside_px
     terms = abs(camera.v0) + np.abs(low) + np.abs(high)
     low, high = below(lowered(low, terms)), above(raised(high, terms))
     known &= curves.monotone
+    outer, rays_at = (scene.runway.x_m.argmin(), scene.runway.x_m.argmax()), [(side[0] + side[1]) / 2 for side in (rays.s, rays.t)]
+    s, t = (np.stack([side[place, marking] for marking in outer for place in (3, 0)]) for side in rays_at)
+    usable = np.isfinite(s) & np.isfinite(t)
+    points = np.where(usable, s, 0.0), np.where(usable, t, 0.0)
     return (
         (np.where(known[0], low[0], -np.inf), np.where(known[1] & inside[1], high[1], np.inf)),
         (np.where(known[2] & inside[2], low[2], -np.inf), np.where(known[3], high[3], np.inf)),
         curves,
+        points,
     )
 
 

@@ -63,16 +63,20 @@ class View:
 
     @staticmethod
     def of(camera: Camera, sets: StateSet, optics: Optics | None = None) -> View:
-        """Of sets with roll and yaw, or without behind a lens."""
+        """Of sets with roll and yaw; without, of sets whose sensor has none but the plus-minus of its calibration."""
         cosine, sine = (part.T.copy() for part in sets.turn)
         fall = sets.reference_fall.T.copy()
-        turns = Turns.none(len(sets)) if sets.roll is None else sets.turns
+        turns = sets.turns if optics is None or sets.roll is not None else optics.level_turns(len(sets))
         return View(turns, cosine, sine, fall, sets.condition, np.full(len(sets), camera.focal_u_px), optics)
 
     @property
-    def swaying(self) -> bool:
-        """False where all rotations are known."""
-        return bool((self.turns.off > 0).any())
+    def largest_focal(self) -> Floats:
+        """F s at most, (sets,)."""
+        return self._largest_fall * self.focal
+
+    @property
+    def _largest_fall(self) -> Floats:
+        return np.maximum(self.fall[0], self.fall[1]) + self.bulge * (1 + np.abs(self.condition * self.fall.min(axis=0)))
 
     def rays(self, tangent_u: Floats, tangent_v: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """X, Y, Z of points of the sensor in the ideal frame, by the rotation in the middle; and S'."""
@@ -164,8 +168,7 @@ class View:
 
     def total(self, by_a: Floats, by_b: Floats) -> Floats:
         """off_a by_a + off_b by_b times the largest s, as both are over F s."""
-        largest = np.maximum(self.fall[0], self.fall[1]) + self.bulge * (1 + np.abs(self.condition * self.fall.min(axis=0)))
-        return (self.turns.off_a * by_a + self.turns.off_b * by_b) * largest
+        return (self.turns.off_a * by_a + self.turns.off_b * by_b) * self._largest_fall
 
     def ideal_tangents(self, left: Floats, right: Floats, tangent_v: Floats) -> tuple[Interval, Bits]:
         """Range of Y/Z over the points between two on a border of the sensor; True where they lie in front, and below the horizon."""
