@@ -33,7 +33,7 @@ from runtime.refine.curves import Curves, Met, shown_rows
 from runtime.refine.interval import Bits, Floats, Interval
 from runtime.refine.lit_pixels import LitPixels
 from runtime.refine.optics import Optics, Stretch
-from runtime.refine.unknowns import Derivatives, Unknowns
+from runtime.refine.unknowns import Unknowns
 from runtime.refine.view import LEAST_DEPTH, ROUNDED_SWAY, Lines, Sway, View
 from runtime.rounding import ROUNDING_SHARE, above, below, column_margin_px, lowered, raised
 from runtime.scene import Camera, Scene
@@ -137,10 +137,9 @@ class SensorBorders:
         assert optics is not None
         assert unknowns is not None
         stretch = optics.between(first, last + 1, row)
-        derivatives = Derivatives.at(view, optics, *stretch.middle, stretch.reach)
-        rest, (low, high) = unknowns.rest_px(derivatives), self._quotients(optics, stretch)
-        known = stretch.known & view.rises_along(optics, stretch) & np.isfinite(rest)
-        w = np.where(known, derivatives.w.middle - unknowns.w, 0.0)
+        w, rest, known = unknowns.sheared_at(view, optics, *stretch.middle, stretch.reach)
+        low, high = self._quotients(optics, stretch)
+        known &= stretch.known & view.rises_along(optics, stretch)
         return *_bounds_where(known, first > last, low - rest, high + rest), w
 
     def _quotients(self, optics: Optics, stretch: Stretch) -> Interval:
