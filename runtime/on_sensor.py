@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.motion import tilted
 from runtime.refine.interval import Bits
 from runtime.refine.lit_pixels import LitPixels
 from runtime.refine.optics import Optics
@@ -33,8 +34,21 @@ def refined(refiner: Refiner, lit: Bits, entries: StateSet, narrowed: bool) -> S
     """
     if len(entries) == 0:
         return entries
-    few = grouped(entries, MOST_ENTRIES)
-    return replace(refiner, extra_budget=-1, window=window_of(refiner.scene, few, refiner.optics)).refine(lit, few, narrowed=narrowed)
+    few, camera, tilt = grouped(entries, MOST_ENTRIES), refiner.scene.camera, 0.0 if refiner.optics is None else refiner.optics.tilt
+    seen = tilted(camera, few, tilt) if tilt else few
+    sensor = replace(refiner, extra_budget=-1, window=window_of(refiner.scene, seen, refiner.optics))
+    left = sensor.refine(lit, seen, narrowed=narrowed)
+    return within_hull(tilted(camera, left, tilt), few) if tilt else left
+
+
+def within_hull(sets: StateSet, others: StateSet) -> StateSet:
+    """The parts of sets that lie in the box around others, but for their scale."""
+    closer = {}
+    for name in INTERVALS[:4]:
+        own, other = getattr(sets, name), getattr(others, name)
+        closer[name] = np.stack([np.maximum(own[:, 0], other[:, 0].min()), np.minimum(own[:, 1], other[:, 1].max())], axis=-1)
+    sets = replace(sets, **closer)
+    return sets[~sets.empty]
 
 
 def grouped(sets: StateSet, most: int) -> StateSet:

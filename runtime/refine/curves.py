@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from runtime.attitude import Turns
 from runtime.refine.interval import Bits, Floats, Interval
 from runtime.refine.optics import ROUNDED_DERIVATIVE, Optics
 from runtime.refine.view import Lines
@@ -75,7 +76,9 @@ class Curves:
         s, half = (low + high) / 2, ((high - low) / 2 + self.margin) * (1 + ROUNDING_SHARE)
         _, mixed, _, off = self.optics.derivatives(s, t, half)
         shown = self.optics.lens.distorted(s, t)[1]
-        miss = np.abs(shown - border) + (np.abs(mixed) + off) * half + self.optics.border(border) + self._rounding(border)
+        turns = self.lines.view.turns
+        off_row = self.optics.border(border) + self.optics.beside_tilt(turns, s, t, half)[1]
+        miss = np.abs(shown - border) + (np.abs(mixed) + off) * half + off_row + self._rounding(border)
         reach = miss / self.rise[:, None] * (1 + ROUNDED_DERIVATIVE)
         (first_low, first_high), first_known = self.lines.at(t - reach)
         (last_low, last_high), last_known = self.lines.at(t + reach)
@@ -86,7 +89,7 @@ class Curves:
         known = known & first_known & last_known & self.monotone[:, None] & self.optics.within(s, t, around)
         beside = (across + off) * half + (np.abs(mixed) + off) * reach
         shown = self.optics.lens.distorted(s, t)[0]
-        beside += self.optics.lens.rounding + ROUNDING_SHARE * np.abs(shown)
+        beside += self.optics.beside_tilt(turns, s, t, around)[0] + self.optics.lens.rounding + ROUNDING_SHARE * np.abs(shown)
         return Met((low, high), (t - reach, t + reach), (shown - beside, shown + beside), known)
 
     def _found(self, border: Floats) -> Floats:
@@ -110,7 +113,7 @@ class Curves:
         return self.optics.lens.rounding + ROUNDING_SHARE * (1 + np.abs(border))
 
 
-def shown_rows(optics: Optics, s: Interval, t: Interval) -> tuple[Interval, Bits]:
+def shown_rows(optics: Optics, turns: Turns, s: Interval, t: Interval) -> tuple[Interval, Bits]:
     """Range of D_y over boxes of rays, of any shape; False where a box is not certainly within the lens's disc."""
     known = np.isfinite(s[0]) & np.isfinite(s[1]) & np.isfinite(t[0]) & np.isfinite(t[1])
     s, t = ((np.where(known, side[0], 0.0), np.where(known, side[1], 0.0)) for side in (s, t))
@@ -119,5 +122,6 @@ def shown_rows(optics: Optics, s: Interval, t: Interval) -> tuple[Interval, Bits
     reach = half_s + half_t
     _, mixed, down, off = optics.derivatives(middle_s, middle_t, reach)
     beside = (np.abs(mixed) + off) * half_s + (down + off) * half_t + optics.lens.rounding
+    beside = beside + optics.beside_tilt(turns, middle_s, middle_t, reach)[1]
     shown = optics.lens.distorted(middle_s, middle_t)[1]
     return (shown - beside, shown + beside), known & optics.within(middle_s, middle_t, reach)

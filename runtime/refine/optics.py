@@ -18,6 +18,7 @@ from runtime.refine.interval import Bits, Floats
 from runtime.rounding import ROUNDING_SHARE
 from runtime.scene import Calibration, Camera, Scene
 from runtime.sensor_map import corner_rays, lens_of
+from runtime.state_set import StateSet
 
 ROUNDED_DERIVATIVE = 2.0**-30
 """Covers what rounding does to a lens's derivatives."""
@@ -79,9 +80,11 @@ class Optics:
         zoom = (1 + ROUNDING_SHARE) / (1 - off.focal_relative)
         return off.focal_relative * zoom, off.principal_px / camera.focal_u_px * zoom, off.principal_px / camera.focal_v_px * zoom
 
-    def level_turns(self, count: int) -> Turns:
-        """The rotations of sets of which no attitude is told."""
-        return Turns.level(count, self.calibration.roll_rad, self.calibration.yaw_rad)
+    def turns(self, sets: StateSet) -> Turns:
+        """The rotations of sets, whose pitch is the one that is seen (`tilt`): by their attitude, or that of the calibration alone."""
+        if sets.roll is None or sets.yaw is None:
+            return Turns.level(len(sets), self.calibration.roll_rad, self.calibration.yaw_rad)
+        return sets.turns if self.tilt == 0 else Turns.of(sets.theta + np.array([-self.tilt, self.tilt]), sets.roll, sets.yaw)
 
     def off(self, turns: Turns) -> tuple[Floats, ...]:
         """How far a, b, g, Q_u and Q_v may be from their middles, (sets,) or (1,) each."""
@@ -102,13 +105,39 @@ class Optics:
         return not (max(self.swings) > 0 or (turns.off > 0).any())
 
     def border(self, border: Floats) -> Floats:
-        """How far from a border's own row, in focal lengths, the lens may show it."""
-        zoom, _, down = self.swings
-        return np.abs(border) * zoom + down
+        """How far from a border's own row, in focal lengths, other focal lengths may show it."""
+        return np.abs(border) * self.swings[0]
 
     def beside_px(self, shown: Floats, focal_px: float) -> Floats:
-        """How far, px, what is shown at some focal lengths from the axis may be from there in the frame."""
-        return self.calibration.principal_px + np.abs(shown) * (self.calibration.focal_relative * focal_px)
+        """How far, px, other focal lengths show what is at some focal lengths from the axis."""
+        return np.abs(shown) * (self.calibration.focal_relative * focal_px)
+
+    @property
+    def tilt(self) -> float:
+        """By how much the pitch that is seen may differ from the ideal frame's: a principal point that lies lower is seen as a pitch.
+
+        Sets that are contracted on the sensor have the pitch c'' = c + p, where the true principal point lies p F_v above the one in the
+        middle (or below, where p < 0), so that the lens shows N at D = (1 + g) N - (Q_u, -p).
+        """
+        return self.swings[2]
+
+    def beside_tilt(self, turns: Turns, s: Floats, t: Floats, reach: Floats) -> tuple[Floats, Floats]:
+        """How far in D_x and D_y points within `reach` of some rays are shown from where the tilt and the principal point cancel.
+
+        A pitch that is p less moves a ray r by -p e x r, e being across the runway: by (dS, dT), and in the frame by J (dS, dT) - (0, p).
+        What is of second order, or due to another e or ray, is bounded by the sizes of all factors.
+        """
+        if self.tilt == 0:
+            return np.zeros(1), np.zeros(1)
+        e_x, e_y, e_z = turns.cos_a * turns.cos_b, turns.sin_a * turns.cos_b, -turns.sin_b
+        x, y, z = e_z * t - e_y, e_x - e_z * s, e_y * s - e_x * t
+        right, down = x - s * z, y - t * z
+        across, mixed, along, off = self.derivatives(s, t, np.zeros(1))
+        length = 1 + s * s + t * t
+        more = 4 * length * length * (self.lens.largest_scale + self.lens.largest_bend) * (self.tilt + turns.off + reach) + 2 * length * off
+        beside_u = np.abs(across * right + mixed * down) + more
+        beside_v = np.abs(mixed * right + along * down - 1) + more
+        return self.tilt * beside_u, self.tilt * beside_v
 
     def between(self, first: Floats, last: Floats, row: Floats) -> Stretch:
         """Of the border between two columns, of one shape; `row` is of that shape, or its last axes."""

@@ -100,7 +100,7 @@ class SensorBorders:
             columns = _as_columns(scene.camera, *lines.at(tangent), margin_px)
         else:
             beside_px = optics.beside_px(np.maximum(np.abs(met.shown[0]), np.abs(met.shown[1])), scene.camera.focal_u_px)
-            columns = _as_columns(scene.camera, met.shown, met.known, margin_px + beside_px)
+            columns = _as_columns(scene.camera, met.shown, met.known, margin_px + beside_px + optics.calibration.principal_px)
         point = view.sway(*_middle_point(scene.camera, sets, view, offset, ideal_near, ideal_far), np.zeros(1))
         return SensorBorders(row, near, far, ideal_near, ideal_far, crossed, columns, margin_px, view, point, met, unknowns)
 
@@ -299,7 +299,7 @@ def _ends_behind_lens(
     inside = (rows >= top) & (rows <= bottom)
     rows = np.where(np.isfinite(rows), np.clip(rows, top, bottom), np.nan)
     rays = _rays_of_ends(camera, sets, view, offset, (rows, rows), margin_px)
-    (low, high), known = shown_rows(optics, rays.s, rays.t)
+    (low, high), known = shown_rows(optics, view.turns, rays.s, rays.t)
     curves = Curves.of(optics, lines, rays.t[0][2], rays.t[1][1], margin_px / camera.focal_u_px)
     beside_px = optics.beside_px(np.maximum(np.abs(low), np.abs(high)), camera.focal_v_px)
     low, high = camera.v0 + camera.focal_v_px * low - beside_px, camera.v0 + camera.focal_v_px * high + beside_px

@@ -19,9 +19,9 @@ from runtime.refine.sight import Sight
 from runtime.rounding import ROUNDING_SHARE, lowered, raised
 from runtime.state_set import StateSet
 
-PIECE_PX = 0.03
+PIECE_PX = 0.01
 """kappa is cut until it shears no offset by more within a piece, into `MOST_PIECES` at most."""
-MOST_PIECES = 16
+MOST_PIECES = 32
 
 Sheared = tuple[Floats, Floats, Floats]
 """Bounds on an offset as it is seen, and w - w*, (markings, rows or borders, sets)."""

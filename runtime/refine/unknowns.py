@@ -19,7 +19,10 @@ with |G| <= sum of |d_p| off_p, and likewise C and kappa. Parameters and pitches
     |eta| <= (|nu| |w - w*| + small w) / (1 - |mu| - |nu| w - small w)
 
 and rho* is the state's own, as C, kappa and G are. So the rest is only what c, k and d leave in the middle, and what eta and the m_p may
-change, times how far each parameter may be off. c, k and d are read off four points; nothing rests on how well they fit but the rest's size.
+change, times how far each parameter may be off. c, k and d are read off four points; nothing rests on how well they fit but its size.
+
+A principal point that lies lower is all but a pitch. So the pitch of sets here is the one that is seen, c'' = c + p with Q_v = -p, and m_v
+is that of both together: a pitch that is p less adds q (cos(c) - sin(c) t).
 """
 
 from __future__ import annotations
@@ -109,9 +112,11 @@ def _turn(cosine: Floats, sine: Floats, off: Floats) -> tuple[Around, Around]:
     return Around(cosine, np.abs(sine) * off + square), Around(sine, np.abs(cosine) * off + square)
 
 
-def _pitch(view: View) -> tuple[Around, Around]:
-    """Cosine and sine of the pitch."""
-    return Around.between(*view.cosine, view.bulge), Around.between(*view.sine, view.bulge)
+def _pitch(view: View, optics: Optics) -> tuple[Around, Around]:
+    """Cosine and sine of the pitch that is seen, and of the ideal frame's."""
+    tilt, square = optics.tilt, optics.tilt**2
+    more_c, more_s = (np.abs(side).max(axis=0) * tilt + square for side in (view.sine, view.cosine))
+    return Around.between(*view.cosine, view.bulge + more_c), Around.between(*view.sine, view.bulge + more_s)
 
 
 @dataclass(frozen=True)
@@ -126,9 +131,9 @@ class Common:
     """w*."""
 
     @staticmethod
-    def of(view: View, moves: Moves, w: Floats) -> Common:
+    def of(view: View, optics: Optics, moves: Moves, w: Floats) -> Common:
         """By some points of each set, (points, sets)."""
-        cosine, sine = _pitch(view)
+        cosine, sine = _pitch(view, optics)
         rows = tuple(np.broadcast_to(each.middle, w.shape).mean(axis=0) for each in moves.rows)
         rows = tuple(np.where(np.isfinite(row), row, 0.0) for row in rows)
         common = sum((off * np.abs(row) for off, row in zip(moves.off, rows, strict=True)), np.zeros(1))
@@ -165,9 +170,9 @@ class Derivatives:
     known: Bits
 
     @staticmethod
-    def of(view: View, moves: Moves, common: Common | None) -> Derivatives:
+    def of(view: View, optics: Optics, moves: Moves, common: Common | None) -> Derivatives:
         """Of points, with what is common to those of a set; without that, only what they are in the middle means anything."""
-        cos_c, sin_c = _pitch(view)
+        cos_c, sin_c = _pitch(view, optics)
         falls = cos_c.middle * moves.t.middle + sin_c.middle
         known = moves.known & (falls > 0)
         w = np.where(known, 1 / np.where(known, falls, 1.0), 1.0)
@@ -194,6 +199,8 @@ class Derivatives:
         m_s = (cos_b * cos_a - q * (leaning * cos_a - cos_c * sin_a)) * per
         m_t = (cos_b * sin_a - q * (cos_c * cos_a + leaning * sin_a)) * per
         m_u, m_v = m_s * moves.inverse[0] + m_t * moves.inverse[1], m_s * moves.inverse[1] + m_t * moves.inverse[2]
+        if optics.tilt > 0:
+            m_v = m_v + q * (cos_c - sin_c * moves.t)
         m = m_a, m_b, m_u * moves.shown[0] + m_v * moves.shown[1], m_u, m_v
         reach = w * w * growth * largest * moves.reach[1]
         return Derivatives(tuple(w * each.middle for each in m), m, w, q.middle, eta, growth, reach, known)
@@ -216,10 +223,10 @@ class Unknowns:
     def of(view: View, optics: Optics, points: tuple[Floats, Floats]) -> Unknowns:
         """By four points of each set, (4, sets): a marking's far and near end, and another's."""
         moves = Moves.at(view, optics, *points, np.zeros(1))
-        found = Derivatives.of(view, moves, None)
+        found = Derivatives.of(view, optics, moves, None)
         w, q = found.w, found.q
         apart_w, apart_q = w[1::2] - w[::2], (q[2] + q[3] - q[0] - q[1]) / 2
-        common = Common.of(view, moves, w)
+        common = Common.of(view, optics, moves, w)
         c, k, d = [], [], []
         for each in found.by:
             value = np.broadcast_to(each, w.shape)
@@ -252,7 +259,7 @@ class Unknowns:
 
     def sheared_at(self, view: View, optics: Optics, s: Floats, t: Floats, reach: Floats) -> tuple[Floats, Floats, Bits]:
         """w - w* and the largest size of the rest, px, at points of stretches (`Moves.at`), and where they are known."""
-        at = Derivatives.of(view, Moves.at(view, optics, s, t, reach), self.common)
+        at = Derivatives.of(view, optics, Moves.at(view, optics, s, t, reach), self.common)
         sheared, rest, swayed = at.w - self.common.w, np.zeros(1), np.zeros(1)
         for m, off in zip(at.m, self.off, strict=True):
             swayed = swayed + off * at.w * at.growth * (np.abs(m.middle) + m.off)

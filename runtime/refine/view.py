@@ -66,7 +66,7 @@ class View:
         """Of sets with roll and yaw; without, of sets whose sensor has none but the plus-minus of its calibration."""
         cosine, sine = (part.T.copy() for part in sets.turn)
         fall = sets.reference_fall.T.copy()
-        turns = sets.turns if optics is None or sets.roll is not None else optics.level_turns(len(sets))
+        turns = sets.turns if optics is None else optics.turns(sets)
         return View(turns, cosine, sine, fall, sets.condition, np.full(len(sets), camera.focal_u_px), optics)
 
     @property
