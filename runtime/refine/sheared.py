@@ -36,8 +36,11 @@ def contract_by_sheared_offsets(sets: StateSet, sight: Sight) -> StateSet:
     borders = sight.borders
     assert isinstance(borders, SensorBorders)
     assert borders.unknowns is not None
-    seen, ends, largest = _seen(borders, sight), sheared_at_ends(borders, sight), borders.unknowns.sheared_px
-    scaled, shifted = borders.unknowns.scaled, borders.unknowns.shifted_px
+    seen, ends = _seen(borders, sight), sheared_at_ends(borders, sight)
+    known = borders.unknowns.known
+    largest, scaled, shifted = (
+        np.where(known, side, 0.0) for side in (borders.unknowns.sheared_px, borders.unknowns.scaled, borders.unknowns.shifted_px)
+    )
     scale = lowered(sets.scale[:, 0] * (1 - scaled), sets.scale[:, 0]), raised(sets.scale[:, 1] * (1 + scaled), sets.scale[:, 1])
     shift = shifted / np.where(scale[0] > 0, scale[0], np.nan)
     shift = np.where(np.isfinite(shift), shift, np.inf) * (1 + ROUNDING_SHARE)
@@ -48,12 +51,14 @@ def contract_by_sheared_offsets(sets: StateSet, sight: Sight) -> StateSet:
         least, most = largest * (2 * number / count - 1), largest * (2 * (number + 1) / count - 1)
         parts, whole = ([_unsheared(part, least, most) for part in side] for side in (seen, at_ends))
         hull = hull.joined(*_by_piece(sight, parts, whole, scale, x))
-    refuted = ~hull.some | (sight.missed.left < 0)
+    refuted = (known & ~hull.some) | (sight.missed.left < 0)
     low, high = (np.where(hull.some, side, 1.0) for side in hull.scale)
-    low, high = lowered(low / (1 + scaled), low), raised(high / np.where(scaled < 1, 1 - scaled, np.nan), high)
+    low, high = lowered(low / (1 + scaled), low), raised(high / (1 - scaled), high)
     x_low, x_high = (np.where(hull.some, side, 0.0) for side in hull.x)
     x_low, x_high = lowered(x_low - shift, np.abs(x_low) + shift), raised(x_high + shift, np.abs(x_high) + shift)
-    high = np.where(np.isfinite(high), high, np.inf)
+    low, high, x_low, x_high = (
+        np.where(known, side, bound) for side, bound in zip((low, high, x_low, x_high), (0.0, np.inf, -np.inf, np.inf), strict=True)
+    )
     return sets.contracted(scale=(low, high), x=(x_low, x_high)).emptied(refuted)
 
 

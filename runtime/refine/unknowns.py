@@ -255,6 +255,11 @@ class Unknowns:
         least = 1 - self.common.growth * self._sum(self.d)
         return np.where(least > LARGEST_CHANGE, self.common.growth / np.where(least > LARGEST_CHANGE, least, 1.0), np.inf) * ROUNDED_SWAY
 
+    @property
+    def known(self) -> Bits:
+        """False where the parameters may move so much that nothing can be said, (sets,)."""
+        return np.isfinite(self._growth) & (self.scaled < LARGEST_CHANGE)
+
     def _total(self, parts: tuple[Floats, ...]) -> Floats:
         return self._sum(parts) * self._growth
 
