@@ -309,15 +309,14 @@ def _ends_behind_lens(
     terms = abs(camera.v0) + np.abs(low) + np.abs(high)
     low, high = below(lowered(low, terms)), above(raised(high, terms))
     known &= curves.monotone
-    outer, rays_at = (scene.runway.x_m.argmin(), scene.runway.x_m.argmax()), [(side[0] + side[1]) / 2 for side in (rays.s, rays.t)]
+    outer, usable = (scene.runway.x_m.argmin(), scene.runway.x_m.argmax()), np.isfinite(rays.s[0]) & np.isfinite(rays.t[0])
+    rays_at = [(np.where(usable, low, 0.0) + np.where(usable, high, 0.0)) / 2 for low, high in (rays.s, rays.t)]
     s, t = (np.stack([side[place, marking] for marking in outer for place in (3, 0)]) for side in rays_at)
-    usable = np.isfinite(s) & np.isfinite(t)
-    points = np.where(usable, s, 0.0), np.where(usable, t, 0.0)
     return (
         (np.where(known[0], low[0], -np.inf), np.where(known[1] & inside[1], high[1], np.inf)),
         (np.where(known[2] & inside[2], low[2], -np.inf), np.where(known[3], high[3], np.inf)),
         curves,
-        points,
+        (s, t),
     )
 
 

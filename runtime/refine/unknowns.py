@@ -154,9 +154,13 @@ class Common:
 
     @property
     def growth(self) -> Floats:
-        """rho* at most; infinite where it is not known."""
-        least = 1 - self.mu - self.nu * np.abs(self.w)
-        return np.where(least > LARGEST_CHANGE, 1 / np.where(least > LARGEST_CHANGE, least, 1.0), np.inf)
+        """rho* at most, where it is known."""
+        return 1 / np.where(self.known, 1 - self.mu - self.nu * np.abs(self.w), 1.0)
+
+    @property
+    def known(self) -> Bits:
+        """False where 1/w may change too much."""
+        return 1 - self.mu - self.nu * np.abs(self.w) > LARGEST_CHANGE
 
 
 @dataclass(frozen=True)
@@ -253,12 +257,12 @@ class Unknowns:
     def _growth(self) -> Floats:
         """rho* at most, times what the q that is seen may be off: as q = q0 + C/(F s) + kappa (w - w*)/(F s) + G q of the q0 seen."""
         least = 1 - self.common.growth * self._sum(self.d)
-        return np.where(least > LARGEST_CHANGE, self.common.growth / np.where(least > LARGEST_CHANGE, least, 1.0), np.inf) * ROUNDED_SWAY
+        return self.common.growth / np.where(least > LARGEST_CHANGE, least, 1.0) * ROUNDED_SWAY
 
     @property
     def known(self) -> Bits:
         """False where the parameters may move so much that nothing can be said, (sets,)."""
-        return np.isfinite(self._growth) & (self.scaled < LARGEST_CHANGE)
+        return self.common.known & (self.common.growth * self._sum(self.d) < LARGEST_CHANGE / 2)
 
     def _total(self, parts: tuple[Floats, ...]) -> Floats:
         return self._sum(parts) * self._growth
@@ -290,5 +294,5 @@ class Unknowns:
             terms = np.abs(by) + np.abs(c) + np.abs(k) * (np.abs(at.w) + np.abs(self.common.w)) + np.abs(d * at.q)
             rest = rest + off * (left + changed + beside + ROUNDING_SHARE * terms)
         rest = rest * self.focal * self._growth
-        known = at.known & np.isfinite(rest)
-        return np.where(known, sheared, 0.0), np.where(known, rest, np.inf), known
+        known = at.known & self.known & np.isfinite(rest)
+        return np.where(known, sheared, 0.0), np.where(known, rest, 0.0), known
