@@ -1,11 +1,12 @@
-"""What a roll and a yaw cost: certified boxes of a turned camera beside those of the level one, with x free within +-0.06 m.
+"""What a roll, a yaw, a lens and a plus-minus cost: certified boxes beside those of the level pinhole, with x free within +-0.06 m.
 
     python scripts/compare_attitude.py [MODEL.onnx] [--frames 40] [--seed 1]
 
 With x and yaw known exactly, where the runway is seen across the frame tells the pitch; so x is free. Without a model, the paper's
-scene with such an x is built first (`free_scene`, a minute or two). Each row is one way of knowing the attitude, on clean frames: medians
-of the half-widths of theta, x, y and z, their ratio to those of the level camera at the same states, with the same pitch reference, runs
-of NN_F and milliseconds a frame, and boxes without the state, of which there must be none. Exit code 1 if there is one.
+scene with such an x is built first (`free_scene`, a minute or two), and again behind each of `CAMERAS`; with one, there are the rows of a
+pinhole alone. Each row is one way of knowing the camera, on clean frames: medians of the half-widths of theta, x, y and z, their ratio to
+those of the level camera at the same states, with the same pitch reference, runs of NN_F and milliseconds a frame, and boxes without the
+state, of which there must be none. Exit code 1 if there is one.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from typing import Annotated
 import numpy as np
 import typer
 from attitudes import Floats
-from compare_limit import constant_network
+from coverage.scenarios import camera_off
+from coverage.states import Stage
+from numpy.typing import NDArray
 from rational_image import RationalView
 from rich.progress import track
 from rich.table import Table
@@ -28,11 +31,13 @@ from turned_state import TurnedState
 
 from runtime import Box, Estimator, ModelError, Scene, terminal
 from runtime.errors import fail
-from runtime.scene import Axis
+from runtime.scene import Axis, Calibration, Distortion
 
 PAPER = Path(__file__).parents[1] / "models" / "paper.toml"
 X_CENTRES_M, X_WIDTH_M, LATERAL_PX = (-0.04, 0.0, 0.04), 0.04, 0.7
 HAIR_RAD = 1e-12
+WHOLE_PIXELS = 2
+"""`line_px` of the camera that is off: NN_F's share of the calibration."""
 
 
 @dataclass(frozen=True)
@@ -44,33 +49,57 @@ class Row:
     yaw: float
     plus_minus: float
     pitch: float | None = None
+    camera: str = "pinhole"
+    """One of `CAMERAS`."""
+
+    @property
+    def level(self) -> bool:
+        """True if no attitude is told."""
+        return self.roll == self.yaw == self.plus_minus == 0
 
 
+CAMERAS = {
+    "pinhole": (None, Calibration()),
+    "barrel": (Distortion("radial-tangential", (-0.28, 0.07, 0.0, 0.0)), Calibration()),
+    "fisheye": (Distortion("fisheye", (-0.013, 0.05, -0.045, 0.012)), Calibration()),
+    "off": (None, Calibration(math.radians(0.05), math.radians(0.05), 0.001, 0.3)),
+}
+"""Lenses, and what the camera may be off by."""
 ROWS = (
     Row("roll 2, yaw -3 degrees, known", 2.0, -3.0, 0.0),
     Row("roll and yaw to +-0.1 degrees", 2.0, -3.0, 0.1),
     Row("and the pitch to +-0.1 degrees", 2.0, -3.0, 0.1, 0.1),
     Row("roll, yaw and pitch to +-0.5 degrees", 2.0, -3.0, 0.5, 0.5),
+    Row("k1 -0.28, k2 0.07, known", 0.0, 0.0, 0.0, camera="barrel"),
+    Row("and roll 2, yaw -3 degrees, known", 2.0, -3.0, 0.0, camera="barrel"),
+    Row("a fisheye lens, known", 0.0, 0.0, 0.0, camera="fisheye"),
+    Row("roll, yaw to 0.05 degrees, F to 0.1 %, centre to 0.3 px", 0.0, 0.0, 0.0, camera="off"),
 )
 
 
-def free_scene() -> Scene:
-    """The paper's scene with x within +-0.06 m."""
-    scene = Scene.load(PAPER)
+def free_scene(camera: str = "pinhole") -> Scene:
+    """The paper's scene with x within +-0.06 m, seen by one of `CAMERAS`."""
+    scene, (distortion, calibration) = Scene.load(PAPER), CAMERAS[camera]
     domain = replace(scene.domain, x_m=Axis(X_CENTRES_M, X_WIDTH_M))
-    return replace(scene, domain=domain, bank=replace(scene.bank, lateral_px=LATERAL_PX))
+    scene = replace(scene, domain=domain, bank=replace(scene.bank, lateral_px=LATERAL_PX))
+    line_px = 0 if calibration.exact else WHOLE_PIXELS
+    return replace(
+        scene,
+        camera=replace(scene.camera, distortion=distortion),
+        calibration=calibration,
+        tolerance=replace(scene.tolerance, line_px=line_px),
+    )
 
 
-def loaded(model: Path | None) -> Estimator:
-    """The model, or that of `free_scene`, with a constant in place of NN_e."""
+def loaded(model: Path | None, camera: str) -> Estimator:
+    """The model, or that of `free_scene`, without NN_e."""
     if model is not None:
         return Estimator.load(model)
-    from build_model.export import export_model
+    from build_model.export import NO_ESTIMATOR, export_model
 
-    scene = free_scene()
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "free.onnx"
-        export_model(scene, path, estimator=constant_network(scene.camera.shape, Path(folder) / "constant.onnx"))
+        export_model(free_scene(camera), path, estimator=NO_ESTIMATOR)
         return Estimator.load(path)
 
 
@@ -92,28 +121,39 @@ def pitch_reference(estimator: Estimator, theta: float, row: Row, rng: np.random
     return Box(estimator.domain.lower - 1, estimator.domain.upper + 1).replace(theta=(reading - half - HAIR_RAD, reading + half + HAIR_RAD))
 
 
-def compared(estimator: Estimator, row: Row, frames: int, seed: int) -> tuple[Floats, Floats, list[int], list[float], int]:
-    """Half-widths turned and level, (frames, 4) each, runs of NN_F, milliseconds a frame, and how many boxes lack the state."""
+def seen(estimator: Estimator, state: TurnedState, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """The frame of a state, of a camera within the scene's calibration."""
+    view = state.view(estimator.scene)
+    if not estimator.scene.calibration.exact:
+        view = camera_off(rng, Stage("", None, estimator.scene, view))
+    return view.image(state.seen).frame.copy()
+
+
+def compared(
+    estimator: Estimator, pinhole: Estimator, row: Row, frames: int, seed: int
+) -> tuple[Floats, Floats, list[int], list[float], int]:
+    """Half-widths and those of the level pinhole, (frames, 4) each, runs of NN_F, ms a frame, and how many boxes lack the state."""
     rng, widths, level, runs, spent, lacking = np.random.default_rng(seed), [], [], [], [], 0
     for _ in track(range(frames), row.text, console=terminal.console(stderr=True), transient=True):
         state = drawn(estimator, row, rng)
-        frame = state.view(estimator.scene).image(state.seen).frame.copy()
+        frame = seen(estimator, state, rng)
         half = math.radians(row.plus_minus)
-        attitude = state.attitude(rng, half, half)
-        if half:  # the reading is the row's own
+        attitude = None if row.level else state.attitude(rng, half, half)
+        if half and attitude is not None:  # the reading is the row's own
             attitude = replace(attitude, roll_rad=math.radians(row.roll), yaw_rad=math.radians(row.yaw))
         prior = pitch_reference(estimator, float(state.angles[1].mid()), row, rng)
         begun = time.perf_counter()
         estimate = estimator.estimate(frame, prior=prior, attitude=attitude)
         spent.append(1000 * (time.perf_counter() - begun))
-        turned = estimator.find(frame, attitude, prior).turned
-        runs.append(len(turned.parts) if turned else 0)
-        if estimate.box is None or not state.within(estimate.box.lower, estimate.box.upper):
+        turned = None if attitude is None else estimator.find(frame, attitude, prior).turned
+        runs.append(len(turned.parts) if turned else 1)
+        held = state.seen if row.level else state  # by the pitch that the ideal frame shows, where no attitude is told
+        if estimate.box is None or not held.within(estimate.box.lower, estimate.box.upper):
             lacking += 1
             continue
-        ideal = RationalView.of(estimator.scene.to_dict()).image(state.seen).frame.copy()
-        prior = pitch_reference(estimator, float(state.seen.floats[0]), row, rng)
-        flat = estimator.estimate(ideal, prior=prior).box
+        ideal = RationalView.of(pinhole.scene.to_dict()).image(state.seen).frame.copy()
+        prior = pitch_reference(pinhole, float(state.seen.floats[0]), row, rng)
+        flat = pinhole.estimate(ideal, prior=prior).box
         if flat is not None:
             widths.append(estimate.box.half_widths)
             level.append(flat.half_widths)
@@ -125,16 +165,18 @@ def main(
     frames: Annotated[int, typer.Option(min=1, help="Frames for each row.")] = 40,
     seed: Annotated[int, typer.Option(min=0, help="Seed of states and readings.")] = 1,
 ) -> None:
-    """Compare certified boxes of a turned camera with those of a level one."""
+    """Compare certified boxes of a turned camera, of one behind a lens, or of one that may be off, with those of a level pinhole."""
     console = terminal.console(140)
     try:
-        estimator = loaded(model)
+        cameras = {name: loaded(model, name) for name in CAMERAS if model is None or name == "pinhole"}
     except ModelError as error:
         fail(error)
-    table = Table("attitude", "half-widths", "of the level camera's", "NN_F runs", "ms", "lacking", title=f"{frames} clean frames a row")
+    table = Table("camera", "half-widths", "of the level camera's", "NN_F runs", "ms", "lacking", title=f"{frames} clean frames a row")
     total = 0
     for row in ROWS:
-        widths, level, runs, spent, lacking = compared(estimator, row, frames, seed)
+        if row.camera not in cameras:
+            continue
+        widths, level, runs, spent, lacking = compared(cameras[row.camera], cameras["pinhole"], row, frames, seed)
         medians = np.median(widths, axis=0), np.median(level, axis=0)
         texts = (" ".join(f"{value:.4f}" for value in medians[0]), " ".join(f"{value:.2f}" for value in medians[0] / medians[1]))
         table.add_row(row.text, *texts, f"{np.median(runs):.0f}", f"{np.median(spent):.0f}", str(lacking))
