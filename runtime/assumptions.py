@@ -14,18 +14,13 @@ def assumptions(scene: Scene) -> list[str]:
     lines = [
         "The state lies in the scene's domain; a box that reaches a face of the domain says so.",
         f"{_turn_of(scene)}, and the camera as in the scene, up to its [calibration] and {tolerance.line_px} px.",
-        f"At most {tolerance.missed_budget} pixels of the runway's image have no lit pixel{near}{_off(scene)}.",
+        f"At most {tolerance.missed_budget} pixels of the runway's image have no lit pixel{near}.",
     ]
+    if scene.camera.pinhole and not scene.calibration.exact:
+        lines.append("No more of the camera's own image have none within what [calibration] leaves of line_px.")
     if tolerance.extra_budget >= 0:
         lines.append(f"At most {tolerance.extra_budget} lit pixels of the true cell's spatial mask are not the runway's{near}.")
     return lines
-
-
-def _off(scene: Scene) -> str:
-    """What is taken for granted of a camera that may be off, beside what NN_F needs."""
-    if scene.calibration.exact or not scene.camera.pinhole:
-        return ""
-    return ", nor of the camera's own image within what its [calibration] leaves of that"
 
 
 def _turn_of(scene: Scene) -> str:

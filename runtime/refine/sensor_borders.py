@@ -25,8 +25,10 @@ A rotation by an angle moves a component of a ray by at most the angle times its
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from runtime.refine.borders import across, ends_in_rows
 from runtime.refine.curves import Curves, Met, shown_rows
@@ -184,7 +186,7 @@ class SensorBorders:
         usable = usable & (place >= 0) & (place < len(self.row))
         place = np.where(usable, place, 0)
 
-        def at(side: Floats) -> Floats:
+        def at(side: NDArray[Any]) -> NDArray[Any]:
             return np.take_along_axis(side, place[:, None], axis=1)[:, 0]
 
         if self.met is None:

@@ -121,7 +121,8 @@ def _pitch(view: View, optics: Optics) -> tuple[Around, Around]:
     """Cosine and sine of the pitch that is seen, and of the ideal frame's."""
     tilt, square = optics.tilt, optics.tilt**2
     more_c, more_s = (np.abs(side).max(axis=0) * tilt + square for side in (view.sine, view.cosine))
-    return Around.between(*view.cosine, view.bulge + more_c), Around.between(*view.sine, view.bulge + more_s)
+    cosine, sine = view.cosine, view.sine
+    return Around.between(cosine[0], cosine[1], view.bulge + more_c), Around.between(sine[0], sine[1], view.bulge + more_s)
 
 
 @dataclass(frozen=True)
