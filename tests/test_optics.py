@@ -212,9 +212,8 @@ def test_a_pinhole_that_is_known_has_no_optics() -> None:
 
 
 def test_a_tilted_set_holds_its_states_at_every_pitch() -> None:
-    sets = StateSet(
-        *(np.array([[low, high]]) for low, high in ((0.5, 0.52), (0.0, 0.0), (0.9, 0.92), (1.7, 1.8))), np.zeros((1, 2)), np.zeros(1)
-    )
+    theta, x, y, z = (np.array([[low, high]]) for low, high in ((0.5, 0.52), (0.0, 0.0), (0.9, 0.92), (1.7, 1.8)))
+    sets = StateSet(theta, x, y, z, np.zeros((1, 2)), np.zeros(1))
     fall = np.sin([0.5, 0.52])
     sets = replace(sets, scale=500 * np.array([[fall[0] / 0.92, fall[1] / 0.9]]))
     camera = replace(PAPER.camera, focal_px=(500.0, 500.0), focal_length_m=None, pixel_pitch_m=None)
