@@ -185,24 +185,22 @@ def any_camera(rng: np.random.Generator) -> list[float]:
 def test_a_lens_that_is_known_costs_next_to_nothing(lens: Distortion, estimator_of: Callable[..., Estimator]) -> None:
     free = estimator_of("free x")
     scene = replace(FREE_X, camera=replace(FREE_X.camera, distortion=lens))
-    assert (extents(free, scene, 8, exact) < 1.3).all()
+    assert (extents(free, scene, 5, exact) < 1.3).all()
 
 
 @pytest.mark.parametrize(
     ("calibration", "most"),
     [
-        (Calibration(roll_rad=OFF.roll_rad), 1.4),
-        (Calibration(yaw_rad=OFF.yaw_rad), 1.4),
-        (Calibration(focal_relative=OFF.focal_relative), 1.4),
+        (Calibration(roll_rad=OFF.roll_rad, yaw_rad=OFF.yaw_rad), 1.4),
         (Calibration(principal_px=OFF.principal_px), 1.5),
         (OFF, 1.8),
     ],
-    ids=["roll", "yaw", "focal", "principal", "all"],
+    ids=["rotation", "principal", "all"],
 )
 def test_a_plus_minus_costs_what_it_hides(calibration: Calibration, most: float) -> None:
     """On the paper's own scene, whose x is fixed; a tolerance of a whole pixel costs five times as much."""
     paper = Estimator.load()
-    assert (extents(paper, replace(PAPER, calibration=calibration), 5, any_camera) < most).all()
+    assert (extents(paper, replace(PAPER, calibration=calibration), 4, any_camera) < most).all()
 
 
 def test_a_pinhole_that_is_known_has_no_optics() -> None:

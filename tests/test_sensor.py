@@ -15,6 +15,7 @@ import pytest
 from scenes import ONE_CELL, PAPER, Floats, random_clutter
 from test_lens import FISHEYE, WIDE
 from test_sensor_map import OFF, seen_through
+from turned_state import TurnedState
 
 from build_model.export import export_model
 from build_model.verify.counterexample import Refuted
@@ -119,6 +120,19 @@ def test_budgets_are_the_sensors(folder: Path) -> None:
         Estimator.load(path, missed_budget=largest + 1)
     with pytest.raises(ModelError, match="extra_budget 0: behind a lens only Theorem A holds"):
         Estimator.load(path, extra_budget=0)
+
+
+@pytest.mark.parametrize("name", ["two missed", "off"])
+def test_an_attitude_is_taken_behind_a_lens_with_missed_pixels_and_beside_a_calibration(name: str, folder: Path) -> None:
+    estimator, rng = Estimator.load(model_of(name, folder)), np.random.default_rng(5)
+    scene = estimator.scene
+    for number, seen in enumerate(states(scene, 2, 6)):
+        state = TurnedState.near(seen, *rng.uniform(-0.06, 0.06, 2))
+        frame = state.view(scene).image(state.seen).frame.copy()
+        frame.ravel()[rng.choice(np.flatnonzero(frame), estimator.missed_budget, replace=False)] = False
+        box = estimator.estimate(frame, attitude=state.attitude(rng, 0.0005 * number)).box
+        assert box is not None
+        assert state.within(box.lower, box.upper)
 
 
 def test_a_prior_and_a_tracker_take_the_sensors_frames(folder: Path) -> None:
