@@ -126,7 +126,7 @@ def test_budgets_are_the_sensors(folder: Path) -> None:
 def test_an_attitude_is_taken_behind_a_lens_with_missed_pixels_and_beside_a_calibration(name: str, folder: Path) -> None:
     estimator, rng = Estimator.load(model_of(name, folder)), np.random.default_rng(5)
     scene = estimator.scene
-    for number, seen in enumerate(states(scene, 2, 6)):
+    for number, seen in enumerate(states(scene, 1, 6), 1):
         state = TurnedState.near(seen, *rng.uniform(-0.06, 0.06, 2))
         frame = state.view(scene).image(state.seen).frame.copy()
         frame.ravel()[rng.choice(np.flatnonzero(frame), estimator.missed_budget, replace=False)] = False
