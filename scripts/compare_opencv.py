@@ -299,7 +299,10 @@ class Baseline:
                 image_points.append((camera.u0 + p_x * (tangent * a + b) - (tangent * c + d), row))
         matrix = np.array([[camera.focal_u_px, 0, camera.u0], [0, camera.focal_v_px, camera.v0], [0, 0, 1]])
         points = np.array(scene_points), np.array(image_points)
-        _, turn, shift = cv2.solvePnP(*points, matrix, None, flags=cv2.SOLVEPNP_ITERATIVE)
+        try:
+            _, turn, shift = cv2.solvePnP(*points, matrix, None, flags=cv2.SOLVEPNP_ITERATIVE)
+        except cv2.error:  # of four points all but on one line
+            return np.full(4, np.nan)
         rotation = cv2.Rodrigues(turn)[0]
         right, ahead, up = (-rotation.T @ shift).ravel()
         pitch = np.arctan2(-rotation[2, 2], rotation[2, 1])
