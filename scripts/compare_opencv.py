@@ -268,11 +268,13 @@ class Baseline:
         state = self._by_lines(measured)
         steps = 1e-6 * np.eye(4)[[0, 2, 3] if self._x is not None else slice(None)]
         for _ in range(NEWTON_STEPS):
-            residual = self._residuals(measured, state)
-            jacobian = np.stack([self._residuals(measured, state + step) - residual for step in steps], axis=1) / 1e-6
-            state = state - 1e6 * np.linalg.lstsq(jacobian, residual, rcond=None)[0] @ steps
             if not np.isfinite(state).all() or state[2] <= 0:
                 break
+            residual = self._residuals(measured, state)
+            jacobian = np.stack([self._residuals(measured, state + step) - residual for step in steps], axis=1) / 1e-6
+            if not np.isfinite(jacobian).all():
+                return np.full(4, np.nan)
+            state = state - 1e6 * np.linalg.lstsq(jacobian, residual, rcond=None)[0] @ steps
         return state
 
     def _residuals(self, measured: Measured, state: Floats) -> Floats:
