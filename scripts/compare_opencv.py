@@ -261,7 +261,8 @@ class Baseline:
         theta = np.arctan2(scale, slope)
         y = self._scene.camera.focal_u_px * np.cos(theta) / slope
         beta = theta + np.arctan(self._tangent(measured.near_row))
-        return np.array([theta, measured.x, y, y / np.tan(beta) - self._near_z])
+        with np.errstate(divide="ignore"):  # of lines that show the near end on the horizon
+            return np.array([theta, measured.x, y, y / np.tan(beta) - self._near_z])
 
     def _by_least_squares(self, measured: Measured) -> Floats:
         """Gauss-Newton on all columns and both ends, from the pose of the lines; x stays if it is known."""
