@@ -60,7 +60,7 @@ class Painting:
         most = max((part[0].shape[1] for part in parcels), default=1)
         none = sensor.ideal.height * sensor.ideal.width
         table = np.full((len(rows), most), none, dtype=np.int32)
-        for at, (part, _) in enumerate(parcels):
+        for at, (part, *_) in enumerate(parcels):
             table[at * PARCEL : at * PARCEL + len(part), : part.shape[1]] = part
         everything = np.concatenate([part[1] for part in parcels]) if parcels else np.zeros(0, dtype=bool)
         return Painting(sensor.ideal.shape, view.window, table, everything, ~view.shown.ravel())
@@ -84,18 +84,48 @@ class Painting:
         return seen
 
 
-def painted(frame: Bits, sensor: SensorMap) -> NDArray[np.uint8]:
-    """The ideal frame, uint8 of {0, 1}, of one frame (height, width) of the sensor, for a map that is this frame's own."""
-    view = View.of(sensor)
-    rows, columns = np.nonzero(frame[view.window])
-    canvas = np.zeros(sensor.ideal.height * sensor.ideal.width + 1, dtype=np.uint8)
-    canvas[:-1] = ~view.shown.ravel()
-    if len(rows):
-        table, everything = what_pixels_show(sensor, rows + view.window[0].start, columns + view.window[1].start)
+@dataclass(frozen=True)
+class Painted:
+    """One frame of the sensor painted by a map that is this frame's own."""
+
+    ideal: NDArray[np.uint8]
+    """The ideal frame, (height, width) of {0, 1}."""
+    rows: Integers
+    columns: Integers
+    """Of the sensor's lit pixels, (lit,), of those that may show something of the ideal frame."""
+    table: NDArray[np.int32]
+    everything: Bits
+    """What each of them paints, as in `Painting`."""
+    whole: Bits
+    """Those that show nothing beyond the ideal frame, (lit,)."""
+
+    @staticmethod
+    def of(frame: Bits, sensor: SensorMap) -> Painted:
+        """Of a frame (height, width) of the sensor."""
+        view = View.of(sensor)
+        rows, columns = np.nonzero(frame[view.window])
+        rows, columns = rows + view.window[0].start, columns + view.window[1].start
+        canvas = np.zeros(sensor.ideal.height * sensor.ideal.width + 1, dtype=np.uint8)
+        canvas[:-1] = ~view.shown.ravel()
+        table, everything, whole = what_pixels_show(sensor, rows, columns)
         canvas[table] = 1
         if everything.any():
             canvas[:] = 1
-    return canvas[:-1].reshape(sensor.ideal.shape)
+        return Painted(canvas[:-1].reshape(sensor.ideal.shape), rows, columns, table, everything, whole)
+
+    def within(self, mask: Bits, frame: NDArray[np.uint8], beyond: bool) -> NDArray[np.uint8]:
+        """What a frame of the sensor has lit that shows some pixel of a mask of the ideal frame, and, if `beyond`, what shows something
+        beyond the ideal frame too: uint8 of {0, 1}.
+        """
+        shows = np.append(mask.ravel(), False)[self.table].any(axis=1) | (self.everything & mask.any())
+        if beyond:
+            gone = self.whole & ~shows
+            within = frame.copy()
+            within[self.rows[gone], self.columns[gone]] = 0
+            return within
+        within, rows, columns = np.zeros_like(frame), self.rows[shows], self.columns[shows]
+        within[rows, columns] = frame[rows, columns]
+        return within
 
 
 @dataclass(frozen=True)
@@ -145,8 +175,9 @@ def _within(side: Interval, size: int) -> slice:
     return slice(math.floor(low), math.ceil(high))
 
 
-def what_pixels_show(sensor: SensorMap, rows: Integers, columns: Integers) -> tuple[NDArray[np.int32], Bits]:
-    """Flat numbers of the ideal pixels that each of some pixels of the sensor paints, (pixels, most), and which paint everything.
+def what_pixels_show(sensor: SensorMap, rows: Integers, columns: Integers) -> tuple[NDArray[np.int32], Bits, Bits]:
+    """Flat numbers of the ideal pixels that each of some pixels of the sensor paints, (pixels, most); which of them paint everything, and
+    which show nothing beyond the ideal frame.
 
     Ideal pixels of the box around the quadrilateral are left out where one of its edges, moved outward, has them on its other side.
     """
@@ -172,7 +203,8 @@ def what_pixels_show(sensor: SensorMap, rows: Integers, columns: Integers) -> tu
         met &= across * aside + along * down <= limit
     ordered = np.sort(np.where(met & ~none, row * width + column, height * width).astype(np.int32), axis=0)
     most = int((ordered < height * width).sum(axis=0).max(initial=1))
-    return ordered[: max(most, 1)].T, everything
+    whole = ~none & (left >= 0) & (right < width) & (top >= 0) & (bottom < height)
+    return ordered[: max(most, 1)].T, everything, whole
 
 
 def _limits(u: Interval, v: Interval, bow: float) -> list[tuple[Floats, Floats, Floats]]:

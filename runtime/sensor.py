@@ -12,7 +12,7 @@ from runtime.ideal import ideal_scene
 from runtime.image import dilated
 from runtime.painting import Painting, ideal_pixels_a_pixel
 from runtime.scene import Scene
-from runtime.sensor_map import SensorMap
+from runtime.sensor_map import SensorMap, runway_beyond
 
 Bits = NDArray[np.bool_]
 
@@ -43,6 +43,11 @@ class Sensor:
     def still(self) -> SensorMap:
         """The map of the sensor, a pinhole's too, for no rotation."""
         return SensorMap.of(self.scene) if self.map is None else self.map
+
+    @cached_property
+    def runway_beyond(self) -> bool:
+        """True if a point of the runway may lie beyond the ideal frame, in some state of the domain, where a turned sensor may show it."""
+        return runway_beyond(self.ideal)
 
     def painted(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The ideal frame of a sensor's frame, uint8 of {0, 1} both: as it is, or painted outward.

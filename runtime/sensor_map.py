@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from runtime.lens import Lens
 from runtime.refine.interval import Floats, Interval
 from runtime.rounding import ROUNDING_SHARE
-from runtime.scene import Calibration, Camera, Scene, SceneError
+from runtime.scene import MARGIN_PX, Calibration, Camera, Scene, SceneError
 from runtime.turn import cosine_and_sine
 
 Integers = NDArray[np.int64]
@@ -198,6 +198,14 @@ def ideal_camera(scene: Scene) -> Camera:
         )
     focal_px = camera.focal_u_px, camera.focal_v_px
     return Camera(right - left, bottom - top, principal_point=(float(-left), float(-top)), focal_px=focal_px)
+
+
+def runway_beyond(scene: Scene) -> bool:
+    """False if the frame of a scene's pinhole certainly holds every point of the runway, in every state of the domain."""
+    camera, ((left, right), (top, bottom)) = scene.camera, _reached_by_runway(scene)
+    least = camera.u0 + camera.focal_u_px * left, camera.v0 + camera.focal_v_px * top
+    most = camera.width - camera.u0 - camera.focal_u_px * right, camera.height - camera.v0 - camera.focal_v_px * bottom
+    return not min(*least, *most) > MARGIN_PX
 
 
 def _seen_by_sensor(camera: Camera, off: Calibration) -> tuple[Angle, Angle]:

@@ -23,7 +23,7 @@ from runtime.estimate import Box
 from runtime.model.entries import Entries
 from runtime.model.format import OVERFLOW
 from runtime.motion import STEEPEST_RAD
-from runtime.painting import painted
+from runtime.painting import Painted
 from runtime.refine.lit_pixels import LitPixels
 from runtime.refine.refiner import Refiner, joined
 from runtime.refine.regions import regions_of
@@ -155,7 +155,7 @@ def started(
     attitude: Attitude,
     seen: Box | None,
 ) -> tuple[dict[str, Any], TurnedStart]:
-    """NN_F's outputs on the painted frames of all bins, taken together, and what of the bank passes.
+    """NN_F's outputs on the painted frames of all bins, taken together, `filtered` in the sensor's frame, and what of the bank passes.
 
     `run`: NN_F on a frame, with the budget of missed pixels times a number. `pixels`: the sensor's frame. `seen`: a box that holds the
     state, with the pitch that the ideal frame shows; None if there is none.
@@ -163,15 +163,16 @@ def started(
     scene = sensor.ideal
     lit = witnesses(pixels.view(np.bool_), sensor.scene.tolerance.line_px)
     if seen is None:
-        outputs = run(np.zeros(scene.camera.shape, dtype=np.uint8), 1)
+        outputs = {**run(np.zeros(scene.camera.shape, dtype=np.uint8), 1), "filtered": np.zeros_like(pixels)}
         return outputs, TurnedStart(sensor, attitude, lit, ((pixels, _with(entries.all[:0], attitude)),))
     together: dict[str, Any] = {}
     parts = []
     for each in bins_of(scene.camera, attitude, (float(seen.lower[0]), float(seen.upper[0]))):
         turns = each.turns
-        frame = painted(lit, turned_map(sensor, turns))
-        outputs = run(frame, met_by_one(scene, turns))
-        parts.append((frame, each.of(entries.sets(outputs["passes"]))))
+        painted = Painted.of(lit, turned_map(sensor, turns))
+        outputs = run(painted.ideal, met_by_one(scene, turns))
+        outputs["filtered"] = painted.within(outputs["filtered"].view(np.bool_), pixels, sensor.runway_beyond)
+        parts.append((painted.ideal, each.of(entries.sets(outputs["passes"]))))
         together = _together(together, outputs)
     return together, TurnedStart(sensor, attitude, lit, tuple(parts))
 
