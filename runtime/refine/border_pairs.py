@@ -17,7 +17,7 @@ from dataclasses import replace
 import numpy as np
 
 from runtime.refine.borders import Borders, across
-from runtime.refine.crossings import closer_at_borders
+from runtime.refine.crossings import at_borders
 from runtime.refine.interval import Floats, Interval
 from runtime.refine.sight import Sight
 from runtime.rounding import OUTWARD_PX, lowered, raised
@@ -50,8 +50,8 @@ def scales_at_borders(sets: StateSet, sight: Sight, borders: Borders) -> Interva
     From each marking by itself where all states have it on one side, and from the differences of markings, which are free of x.
     """
     usable = sight.crossed & ~sight.missed.halves
-    first = closer_at_borders(np.where(usable, sight.halves.first, -np.inf), np.maximum)
-    last = closer_at_borders(np.where(usable, sight.halves.last, np.inf), np.minimum)
+    first = at_borders(np.where(usable, sight.halves.first, -np.inf), np.maximum)
+    last = at_borders(np.where(usable, sight.halves.last, np.inf), np.minimum)
     edge = sight.scene.camera.u0 + borders.margin_px
     offset_low, offset_high = first - edge, last + (1 + 2 * borders.margin_px - edge)
     left, right = across(sight.scene, sets)

@@ -35,6 +35,7 @@ from runtime.refine.ends import contract_by_ends
 from runtime.refine.interval import Bits, Floats
 from runtime.refine.lit_pixels import LitPixels
 from runtime.refine.offsets import contract_by_offsets
+from runtime.refine.optics import Optics
 from runtime.refine.sight import Sight, Vouched
 from runtime.refine.vouched import contract_by_vouched
 from runtime.scene import Scene
@@ -108,6 +109,8 @@ class Refiner:
     extra_budget: int
     window: tuple[slice, slice] = (slice(None), slice(None))
     """Rows and columns outside of which pixels count as lit, whatever the frame shows there."""
+    optics: Optics | None = None
+    """Of the lens, where the frame is that of the sensor behind it; `scene` is the sensor's then."""
 
     def refine(self, frame: Bits, entries: StateSet, vouched_pixels: Bits | None = None, narrowed: bool = False) -> StateSet:
         """Slices that hold all states of `entries` which are consistent with `frame`, (height, width); none if there is none.
@@ -119,11 +122,12 @@ class Refiner:
             return entries
         witnesses = LitPixels.of(frame, self.window, beyond=True)
         vouched = None if vouched_pixels is None else Vouched(LitPixels.of(vouched_pixels, self.window, beyond=False), self.extra_budget)
-        level = NONE_MISSED if entries.roll is None else TURNED
+        flat = self.optics is None and entries.roll is None
+        level = NONE_MISSED if flat else TURNED
         search = level if self.missed_budget == 0 else NARROWED if narrowed else SOME_MISSED
-        if entries.roll is not None and entries.yaw is not None:
+        if not flat:
             entries = self._contracted(witnesses, vouched, entries)  # most contradict the frame as they are
-            search = self._with_turns(search, entries)
+            search = self._with_turns(search, entries) if entries.roll is not None else search
         most_sets = max(LARGEST_ROUND // (len(self.scene.runway.markings) * witnesses.rows), 1)
         others = search.others
         a_face = min(max(most_sets // (FACES * 2 * math.prod(others.values())), 1), search.pieces)
@@ -164,7 +168,7 @@ class Refiner:
         if len(sets) == 0:
             return sets
         sets = contract_by_altitude(self.scene.camera, sets)
-        sight = Sight.of(self.scene, sets, witnesses, self.missed_budget, vouched)
+        sight = Sight.of(self.scene, sets, witnesses, self.missed_budget, vouched, self.optics)
         if self.missed_budget > 0:  # then most sets miss too many pixels, and each costs more
             left = np.flatnonzero(sight.missed.left >= 0)
             sets, sight = sets[left], sight.of_sets(left)
