@@ -73,18 +73,18 @@ class Search:
     patience: int = 1
     """So many rounds in a row must take less than the share."""
 
-    @property
-    def others(self) -> dict[str, int]:
-        """Parts along all intervals but theta's."""
-        return {name: getattr(self, name) for name in ("z", "scale", "roll", "yaw")}
+    def others(self, number: int) -> dict[str, int]:
+        """Parts along all intervals but theta's in the round of this number: along scale and z in turns, scale first."""
+        parts = {name: getattr(self, name) for name in ("z", "scale", "roll", "yaw")}
+        return parts | {"scale" if number % 2 else "z": 1}
 
 
 FACES = 6
 """Of the box in theta, y and z that is searched."""
-NONE_MISSED = Search(first=48, sets=64, pieces=8, rounds=4, gain=0.05, z=2)
-SOME_MISSED = Search(first=48, sets=96, pieces=4, rounds=20, gain=0.03, z=2, scale=2)
+NONE_MISSED = Search(first=48, sets=64, pieces=8, rounds=6, gain=0.05, z=2)
+SOME_MISSED = Search(first=48, sets=144, pieces=6, rounds=20, gain=0.03, z=2, scale=2)
 """Missed pixels are counted where windows are a pixel or two wide (`missed`): then smaller pieces pay, cut along the scale too."""
-NARROWED = Search(first=48, sets=96, pieces=4, rounds=20, gain=0.002, z=2, scale=2)
+NARROWED = Search(first=48, sets=144, pieces=4, rounds=20, gain=0.002, z=2, scale=2)
 """Pixels may be missed, and the entries were cut to a prior: they are few, so that there is time for small gains."""
 TURNED = Search(first=512, sets=512, pieces=2, rounds=8, gain=0.02, finest=4, z=2)
 """Pairs of borders tell nothing on a turned sensor: theta is cut, round by round."""
@@ -129,16 +129,15 @@ class Refiner:
             entries = self._contracted(witnesses, vouched, entries)  # most contradict the frame as they are
             search = self._with_turns(search, entries) if entries.roll is not None else search
         most_sets = max(LARGEST_ROUND // (len(self.scene.runway.markings) * witnesses.rows), 1)
-        others = search.others
-        a_face = min(max(most_sets // (FACES * 2 * math.prod(others.values())), 1), search.pieces)
+        a_face = min(max(most_sets // (FACES * 2 * max(math.prod(search.others(number).values()) for number in (0, 1))), 1), search.pieces)
         slices = _parts(min(search.first, most_sets), len(entries), 1, search.finest)
         pieces = self._contracted(witnesses, vouched, _cut(entries, theta=slices, roll=search.roll, yaw=search.yaw))
         extent, idle = _extent(pieces), 0
         for number in range(search.rounds if len(pieces) else 0):
             outer = _carries_a_face(pieces, a_face)
-            cuts = others if number else others | {"z": 1}  # which tells little before theta is narrow
-            slices = _parts(min(search.sets, most_sets), int(outer.sum()) * math.prod(cuts.values()), 2, search.finest)
-            finer = self._contracted(witnesses, vouched, _cut(pieces[outer], theta=slices, **cuts))
+            others = search.others(number)
+            slices = _parts(min(search.sets, most_sets), int(outer.sum()) * math.prod(others.values()), 2, search.finest)
+            finer = self._contracted(witnesses, vouched, _cut(pieces[outer], theta=slices, **others))
             pieces, before = joined(finer, pieces[~outer]), extent
             extent = _extent(pieces)
             idle = idle + 1 if (extent > (1 - search.gain) * before).all() else 0
