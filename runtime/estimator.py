@@ -201,7 +201,7 @@ class Estimator:
             if self.sensor.map is not None and self.missed_budget > 0:
                 raise ValueError(f"attitude: found missed_budget {self.missed_budget} behind a lens; load the model with 0")
             pixels, seen = own, self._seen(prior, attitude)
-            outputs, turned = started(self.sensor, self._entries, self._run_by_theorem_a, own, attitude, seen)
+            outputs, turned = started(self.sensor, self._entries, self._run_by_theorem_a, own, attitude, seen, self._refiner.window)
         overflow = bool(outputs.pop(OVERFLOW, False))
         cell, support, mismatch, passes, lower, upper, filtered, network_state = outputs.values()
         network = np.where(self.scene.domain.fixed, self.domain.lower, network_state)

@@ -23,6 +23,7 @@ from runtime.estimate import Box
 from runtime.model.entries import Entries
 from runtime.model.format import OVERFLOW
 from runtime.motion import STEEPEST_RAD
+from runtime.outline import Window
 from runtime.painting import Painted
 from runtime.refine.lit_pixels import LitPixels
 from runtime.refine.refiner import Refiner, joined
@@ -154,11 +155,12 @@ def started(
     pixels: NDArray[np.uint8],
     attitude: Attitude,
     seen: Box | None,
+    window: Window,
 ) -> tuple[dict[str, Any], TurnedStart]:
     """NN_F's outputs on the painted frames of all bins, taken together, `filtered` in the sensor's frame, and what of the bank passes.
 
     `run`: NN_F on a frame, with the budget of missed pixels times a number. `pixels`: the sensor's frame. `seen`: a box that holds the
-    state, with the pitch that the ideal frame shows; None if there is none.
+    state, with the pitch that the ideal frame shows; None if there is none. `window`: of the ideal frame, what is looked at.
     """
     scene = sensor.ideal
     lit = witnesses(pixels.view(np.bool_), sensor.scene.tolerance.line_px)
@@ -169,9 +171,12 @@ def started(
     parts = []
     for each in bins_of(scene.camera, attitude, (float(seen.lower[0]), float(seen.upper[0]))):
         turns = each.turns
-        painted = Painted.of(lit, turned_map(sensor, turns))
+        map_of_bin = turned_map(sensor, turns)
+        painted = Painted.of(lit, map_of_bin, sensor.outline, window)
         outputs = run(painted.ideal, met_by_one(scene, turns))
-        outputs["filtered"] = painted.within(outputs["filtered"].view(np.bool_), pixels, sensor.runway_beyond)
+        outputs["filtered"] = painted.within(outputs["filtered"].view(np.bool_), pixels)
+        if sensor.runway_beyond:
+            outputs["filtered"] |= pixels & sensor.outline.not_within(map_of_bin)
         parts.append((painted.ideal, each.of(entries.sets(outputs["passes"]))))
         together = _together(together, outputs)
     return together, TurnedStart(sensor, attitude, lit, tuple(parts))
