@@ -188,6 +188,16 @@ def turned_map(sensor: Sensor, turns: Turns) -> SensorMap:
     return replace(sensor.still, turn=Turn(a, b))
 
 
+def seen_by_turned(sensor: Sensor, mask: Bits, attitude: Attitude, pitch: float, window: Window) -> Bits:
+    """The pixels of the sensor that show some pixel of a mask of the ideal frame, within its window: for one pitch that this shows, and
+    the attitude's middle. For drawing.
+    """
+    sides = (np.array([[side, side]]) for side in (pitch, attitude.roll_rad, attitude.yaw_rad))
+    every = np.ones(sensor.scene.camera.shape, dtype=np.uint8)
+    whole = Painted.of(every.view(np.bool_), turned_map(sensor, Turns.of(*sides)), sensor.outline, window)
+    return whole.within(mask, every).view(np.bool_)
+
+
 def _sides(turns: Turns) -> tuple[tuple[Floats, Floats, Floats], ...]:
     return (turns.cos_a, turns.sin_a, turns.off_a), (turns.cos_b, turns.sin_b, turns.off_b)
 
