@@ -24,6 +24,7 @@ from runtime.model.entries import Entries
 from runtime.model.format import OVERFLOW
 from runtime.motion import STEEPEST_RAD
 from runtime.on_sensor import refined
+from runtime.outline import Window
 from runtime.painting import Painted
 from runtime.refine.refiner import Refiner, joined
 from runtime.refine.regions import regions_of
@@ -125,11 +126,12 @@ def started(
     pixels: NDArray[np.uint8],
     attitude: Attitude,
     seen: Box | None,
+    window: Window,
 ) -> tuple[dict[str, Any], TurnedStart]:
     """NN_F's outputs on the painted frames of all bins, taken together, `filtered` in the sensor's frame, and what of the bank passes.
 
     `run`: NN_F on a frame, with the budget of missed pixels times a number. `pixels`: the sensor's frame. `seen`: a box that holds the
-    state, with the pitch that the ideal frame shows; None if there is none.
+    state, with the pitch that the ideal frame shows; None if there is none. `window`: of the ideal frame, what is looked at.
     """
     scene = sensor.ideal
     lit = witnesses(pixels.view(np.bool_), sensor.scene.tolerance.line_px)
@@ -140,9 +142,12 @@ def started(
     parts = []
     for each in bins_of(scene.camera, attitude, (float(seen.lower[0]), float(seen.upper[0]))):
         turns = each.turns
-        painted = Painted.of(lit, turned_map(sensor, turns))
+        map_of_bin = turned_map(sensor, turns)
+        painted = Painted.of(lit, map_of_bin, sensor.outline, window)
         outputs = run(painted.ideal, met_by_one(scene, turns))
-        outputs["filtered"] = painted.within(outputs["filtered"].view(np.bool_), pixels, sensor.runway_beyond)
+        outputs["filtered"] = painted.within(outputs["filtered"].view(np.bool_), pixels)
+        if sensor.runway_beyond:
+            outputs["filtered"] |= pixels & sensor.outline.not_within(map_of_bin)
         parts.append(each.of(entries.sets(outputs["passes"])))
         together = _together(together, outputs)
     return together, TurnedStart(sensor, attitude, lit, tuple(parts))
@@ -152,6 +157,16 @@ def turned_map(sensor: Sensor, turns: Turns) -> SensorMap:
     """The map of a sensor for the rotations of one set."""
     a, b = ((float(cosine[0]), float(sine[0]), float(off[0])) for cosine, sine, off in _sides(turns))
     return replace(sensor.still, turn=Turn(a, b))
+
+
+def seen_by_turned(sensor: Sensor, mask: Bits, attitude: Attitude, pitch: float, window: Window) -> Bits:
+    """The pixels of the sensor that show some pixel of a mask of the ideal frame, within its window: for one pitch that this shows, and
+    the attitude's middle. For drawing.
+    """
+    sides = (np.array([[side, side]]) for side in (pitch, attitude.roll_rad, attitude.yaw_rad))
+    every = np.ones(sensor.scene.camera.shape, dtype=np.uint8)
+    whole = Painted.of(every.view(np.bool_), turned_map(sensor, Turns.of(*sides)), sensor.outline, window)
+    return whole.within(mask, every).view(np.bool_)
 
 
 def _sides(turns: Turns) -> tuple[tuple[Floats, Floats, Floats], ...]:

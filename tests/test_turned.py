@@ -16,6 +16,7 @@ from turned_state import TurnedState
 
 from build_model.export import NO_ESTIMATOR, export_model
 from runtime import Attitude, Box, Estimator, Motion, Outcome, Scene, Tracker
+from runtime.attitude import Turns
 from runtime.on_sensor import grouped
 from runtime.painting import Painted
 from runtime.scene import AttitudeBounds, Axis, Camera, Distortion
@@ -59,6 +60,12 @@ def image(scene: Scene, state: TurnedState) -> np.ndarray:
     return state.view(scene).image(state.seen).frame.copy()
 
 
+def painted(scene: Scene, frame: np.ndarray, turns: Turns) -> np.ndarray:
+    """What is painted of a frame."""
+    sensor = Sensor.of(scene)
+    return Painted.of(frame, turned_map(sensor, turns), sensor.outline).ideal
+
+
 # --- painting ---
 
 
@@ -72,9 +79,9 @@ def test_no_pixel_of_the_runway_is_lost_in_painting(scene: Scene) -> None:
         c = float(state.seen.floats[0])
         turns = Bin(np.array([[c - 1e-12, c + 1e-12]]), np.array([attitude.roll]), np.array([attitude.yaw])).turns
         ideal = RationalView.of(scene.to_dict()).image(state.seen).frame
-        canvas = Painted.of(image(scene, state), turned_map(Sensor.of(scene), turns)).ideal.view(bool)
+        canvas = painted(scene, image(scene, state), turns).view(bool)
         assert not (ideal & ~canvas).any(), number
-        unseen = Painted.of(np.zeros(scene.camera.shape, dtype=bool), turned_map(Sensor.of(scene), turns)).ideal.view(bool)
+        unseen = painted(scene, np.zeros(scene.camera.shape, dtype=bool), turns).view(bool)
         if not plus_minus.any():
             assert (canvas & ~unseen).sum() <= 4 * ideal.sum() + 9
 
@@ -90,7 +97,7 @@ def test_a_missed_pixel_spoils_no_more_of_the_ideal_image_than_is_budgeted() -> 
         for dark in rng.choice(np.flatnonzero(seen), 3, replace=False):
             frame = seen.copy()
             frame.ravel()[dark] = False
-            assert (ideal & ~Painted.of(frame, turned_map(Sensor.of(PAPER), turns)).ideal.view(bool)).sum() <= met_by_one(PAPER, turns) <= 9
+            assert (ideal & ~painted(PAPER, frame, turns).view(bool)).sum() <= met_by_one(PAPER, turns) <= 9
 
 
 def test_bins_cover_the_attitude() -> None:
