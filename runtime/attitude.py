@@ -212,6 +212,14 @@ def seen_pitch(pitch: Floats, yaw: Floats) -> Floats:
     return _angles(_product(_tangents(pitch), (1 / cosine[1], 1 / cosine[0])))
 
 
+def rotation_at(theta: Floats, attitude: Attitude) -> tuple[Floats, Floats, Floats]:
+    """(a, b, c) of cameras that look down by `theta`, any shape, with the attitude's own roll and yaw. For drawing: no interval."""
+    tangent, psi = np.tan(theta), attitude.yaw_rad
+    c = np.arctan(tangent / math.cos(psi))
+    b = np.arctan(-np.cos(c) * math.tan(psi))
+    return np.arctan(np.sin(b) * np.tan(c)) - attitude.roll_rad, b, c
+
+
 def lead(seen_pitch: Floats, pitch: Floats, yaw: Floats) -> Floats:
     """Interval of c - theta, (sets, 2), for a pitch c that the ideal frame shows and the camera's theta, in these intervals at this yaw.
 

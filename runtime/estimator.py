@@ -38,7 +38,7 @@ from runtime.refine.witnesses import witnesses
 from runtime.scene import STATE_NAMES, Scene, SceneError
 from runtime.sensor import Sensor
 from runtime.state_set import StateSet
-from runtime.turned import TurnedStart, hull_of, seen_box, started
+from runtime.turned import TurnedStart, hull_of, seen_box, seen_by_turned, started
 
 REFINED_BEYOND_PX = 2
 """How far beyond the spatial masks the refinement looks at pixels; those farther out it takes for lit."""
@@ -207,12 +207,12 @@ class Estimator:
         if attitude is None:
             outputs = self.run_unchecked(self.sensor.painted(own))
         else:
-            seen = self._seen(prior, attitude)
-            outputs, turned = started(self.sensor, self._entries, self._run_by_theorem_a, own, attitude, seen, self.beside_px)
+            seen, window = self._seen(prior, attitude), self._refiner.window
+            outputs, turned = started(self.sensor, self._entries, self._run_by_theorem_a, own, attitude, seen, self.beside_px, window)
         overflow = bool(outputs.pop(OVERFLOW, False))
         cell, support, mismatch, passes, lower, upper, filtered, network_state = outputs.values()
         network = np.where(self.scene.domain.fixed, self.domain.lower, network_state)
-        if self.sensor.map is not None:
+        if self.sensor.map is not None and turned is None:
             filtered = own & self.sensor.seen_in(filtered.view(np.bool_))
         return Found(own, int(cell), support, mismatch, passes, lower, upper, filtered, network, overflow, turned)
 
@@ -334,9 +334,16 @@ class Estimator:
             return by_processes(partial(_loaded, self._arguments), self.scene.camera.width, pixels, processes)
         return by_threads(partial(self.estimate, refine=False), pixels, processes)
 
-    def spatial_mask(self, cell: int) -> NDArray[np.bool_]:
-        """S of a cell, (height, width): every pixel that one of its states can light, widened by the tolerance."""
-        return self.sensor.seen_in(self._entries.within(cell, np.ones(self.ideal.camera.shape, dtype=np.bool_)))
+    def spatial_mask(self, cell: int, attitude: Attitude | None = None) -> NDArray[np.bool_]:
+        """S of a cell, (height, width): every pixel that one of its states can light, widened by the tolerance.
+
+        For an attitude what a camera at its middle and at the middle of the cell's pitch shows of it, for drawing.
+        """
+        mask = self._entries.within(cell, np.ones(self.ideal.camera.shape, dtype=np.bool_))
+        if attitude is None:
+            return self.sensor.seen_in(mask)
+        lower, upper = self.scene.domain.cells()
+        return seen_by_turned(self.sensor, mask, attitude, float(lower[cell][0] + upper[cell][0]) / 2, self._refiner.window)
 
     def _reaches_boundary(self, found: Found, box: Box, left: StateSet | None) -> bool:
         """True if a box reaches a face of the domain; of a rolled or yawed camera, if what is left does, by the ideal frame's pitch."""

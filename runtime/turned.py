@@ -24,7 +24,8 @@ from runtime.model.entries import Entries
 from runtime.model.format import OVERFLOW
 from runtime.motion import STEEPEST_RAD
 from runtime.on_sensor import refined
-from runtime.painting import painted
+from runtime.outline import Window
+from runtime.painting import Painted
 from runtime.refine.refiner import Refiner, joined
 from runtime.refine.regions import regions_of
 from runtime.refine.witnesses import witnesses
@@ -126,23 +127,29 @@ def started(
     attitude: Attitude,
     seen: Box | None,
     beside_px: int,
+    window: Window,
 ) -> tuple[dict[str, Any], TurnedStart]:
-    """NN_F's outputs on the painted frames of all bins, taken together, and what of the bank passes.
+    """NN_F's outputs on the painted frames of all bins, taken together, `filtered` in the sensor's frame, and what of the bank passes.
 
     `run`: NN_F on a frame, with the budget of missed pixels times a number. `pixels`: the sensor's frame. `seen`: a box that holds the
     state, with the pitch that the ideal frame shows; None if there is none. `beside_px`: how far beside its place a pixel may fire.
+    `window`: of the ideal frame, what is looked at.
     """
     scene = sensor.ideal
     lit = witnesses(pixels.view(np.bool_), beside_px)
     if seen is None:
-        outputs = run(np.zeros(scene.camera.shape, dtype=np.uint8), 1)
+        outputs = {**run(np.zeros(scene.camera.shape, dtype=np.uint8), 1), "filtered": np.zeros_like(pixels)}
         return outputs, TurnedStart(sensor, attitude, lit, (_with(entries.all[:0], attitude),))
     together: dict[str, Any] = {}
     parts = []
     for each in bins_of(scene.camera, attitude, (float(seen.lower[0]), float(seen.upper[0]))):
         turns = each.turns
-        frame = painted(lit, turned_map(sensor, turns))
-        outputs = run(frame, met_by_one(scene, turns, sensor.still))
+        map_of_bin = turned_map(sensor, turns)
+        painted = Painted.of(lit, map_of_bin, sensor.outline, window)
+        outputs = run(painted.ideal, met_by_one(scene, turns, sensor.still))
+        outputs["filtered"] = painted.within(outputs["filtered"].view(np.bool_), pixels)
+        if sensor.runway_beyond:
+            outputs["filtered"] |= pixels & sensor.outline.not_within(map_of_bin)
         parts.append(each.of(entries.sets(outputs["passes"])))
         together = _together(together, outputs)
     return together, TurnedStart(sensor, attitude, lit, tuple(parts))
@@ -152,6 +159,16 @@ def turned_map(sensor: Sensor, turns: Turns) -> SensorMap:
     """The map of a sensor for the rotations of one set."""
     a, b = ((float(cosine[0]), float(sine[0]), float(off[0])) for cosine, sine, off in _sides(turns))
     return replace(sensor.still, turn=Turn(a, b))
+
+
+def seen_by_turned(sensor: Sensor, mask: Bits, attitude: Attitude, pitch: float, window: Window) -> Bits:
+    """The pixels of the sensor that show some pixel of a mask of the ideal frame, within its window: for one pitch that this shows, and
+    the attitude's middle. For drawing.
+    """
+    sides = (np.array([[side, side]]) for side in (pitch, attitude.roll_rad, attitude.yaw_rad))
+    every = np.ones(sensor.scene.camera.shape, dtype=np.uint8)
+    whole = Painted.of(every.view(np.bool_), turned_map(sensor, Turns.of(*sides)), sensor.outline, window)
+    return whole.within(mask, every).view(np.bool_)
 
 
 def _sides(turns: Turns) -> tuple[tuple[Floats, Floats, Floats], ...]:

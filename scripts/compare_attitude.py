@@ -20,14 +20,13 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from attitudes import Floats
 from coverage.scenarios import camera_off
 from coverage.states import Stage
 from numpy.typing import NDArray
 from rational_image import RationalView
 from rich.progress import track
 from rich.table import Table
-from turned_state import TurnedState
+from turned_state import Floats, TurnedState
 
 from runtime import Box, Estimator, ModelError, Scene, terminal
 from runtime.errors import fail
