@@ -102,7 +102,7 @@ def test_the_refinement_keeps_the_state_whatever_the_lens_and_the_camera(off: Of
 
 def shown(view: RationalView, state: RationalState, x: Fraction, z: Fraction) -> tuple[arb, arb]:
     """Column and row of a ground point, as a ball."""
-    right, down, ahead = (arb(part.numerator) / part.denominator for part in view._turned(state, x, z))
+    right, down, ahead = (arb(part.numerator) / part.denominator for part in view.in_camera(state, x, z))
     lens = view.lens or BallLens(False, (Fraction(0),) * 5)
     across, below = lens.shown(right / ahead, down / ahead)
     column, row = (arb(side.numerator) / side.denominator for side in (view.u0, view.v0))
@@ -124,7 +124,7 @@ def test_ends_and_borders_are_met_where_the_borders_say(off: OffCase) -> None:
     borders = SensorBorders.of(scene, sets, LitPixels.of(case.image, WHOLE, beyond=True), optics)
     with ctx.workprec(100):
         for number, stripe in enumerate(view.stripes):
-            assume(min(view._turned(case.state, stripe.x, z)[2] for z in (stripe.near_z, stripe.far_z)) > 0)
+            assume(min(view.in_camera(case.state, stripe.x, z)[2] for z in (stripe.near_z, stripe.far_z)) > 0)
             ends = [shown(view, case.state, stripe.x, z) for z in (stripe.near_z, stripe.far_z)]
             crossed = np.flatnonzero(borders.crossed[number, :, 0])
             if len(crossed):
@@ -185,7 +185,7 @@ def any_camera(rng: np.random.Generator) -> list[float]:
 def test_a_lens_that_is_known_costs_next_to_nothing(lens: Distortion, estimator_of: Callable[..., Estimator]) -> None:
     free = estimator_of("free x")
     scene = replace(FREE_X, camera=replace(FREE_X.camera, distortion=lens))
-    assert (extents(free, scene, 5, exact) < 1.3).all()
+    assert (extents(free, scene, 8, exact) < 1.3).all()
 
 
 @pytest.mark.parametrize(
