@@ -2,7 +2,8 @@
 
     python scripts/compare_opencv.py [--model MODEL.onnx] [--frames 200] [--clutter 0 --clutter 0.02 --clutter 0.05] [-o FILE.csv]
 
-The baseline is told all that we know: the exact camera, no roll or yaw, x, the markings, and the domain of states.
+The baseline is told all that we know: the exact camera, no roll or yaw, x, the markings, and the domain of states. Frames of a camera with
+a lens are undistorted for it first.
 
 1. The frame is cropped to what the runway can reach from the domain. Connected components of lit pixels smaller than a marking can be
    are removed: a marking is one component, clutter is mostly single pixels.
@@ -26,6 +27,7 @@ a busy machine only ratios mean something.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -308,8 +310,25 @@ class Answer:
         return float("nan") if self.state is None else float(np.linalg.norm(self.state - self.truth))
 
 
+@functools.cache
+def undistortion(scene: Scene, ideal: Scene) -> Callable[[Frame], Frame]:
+    """What users do with frames of a lens first: OpenCV's undistortion, onto the ideal frame, each pixel from the one that it lies in."""
+    camera, to = scene.camera, ideal.camera
+    if camera.distortion is None or camera.pinhole:
+        return lambda frame: frame
+    matrices = [
+        np.array([[each.focal_u_px, 0, each.u0 - 0.5], [0, each.focal_v_px, each.v0 - 0.5], [0, 0, 1]])  # OpenCV counts from centres
+        for each in (camera, to)
+    ]
+    coefficients, size = np.array(camera.distortion.coefficients), (to.width, to.height)
+    of = cv2.fisheye.initUndistortRectifyMap if camera.distortion.model == "fisheye" else cv2.initUndistortRectifyMap
+    maps = of(matrices[0], coefficients, np.eye(3), matrices[1], size, cv2.CV_32FC1)
+    return lambda frame: np.asarray(cv2.remap(frame, maps[0], maps[1], cv2.INTER_NEAREST), dtype=np.uint8)
+
+
 def answers_of(estimator: Estimator, baseline: Baseline, truth: Floats, frame: Frame, clutter: float) -> Iterator[Answer]:
-    """Every method on one frame: ours first, then each detector with each solver."""
+    """Every method on one frame: ours first, then each detector with each solver, behind a lens on the undistorted frame."""
+    straight = undistortion(estimator.scene, estimator.ideal)
     unrefined, milliseconds = timed(lambda: estimator.estimate(frame, refine=False))
     yield Answer(clutter, truth, "ours: NN_e alone", unrefined.network_state, milliseconds)
     estimate, milliseconds = timed(lambda: estimator.estimate(frame))
@@ -317,7 +336,7 @@ def answers_of(estimator: Estimator, baseline: Baseline, truth: Floats, frame: F
     yield Answer(clutter, truth, "ours: centre of the box", centre, milliseconds)
     yield Answer(clutter, truth, "ours: the estimate, certified", estimate.state, milliseconds)
     for detector, solver in itertools.product(DETECTORS, SOLVERS):
-        state, milliseconds = timed(lambda detector=detector, solver=solver: baseline.estimate(frame, detector, solver))
+        state, milliseconds = timed(lambda detector=detector, solver=solver: baseline.estimate(straight(frame), detector, solver))
         yield Answer(clutter, truth, f"{detector}, {solver}", state, milliseconds)
 
 
@@ -372,9 +391,7 @@ def main(
     errors = terminal.console(stderr=True)
     try:
         estimator = Estimator.load(model)
-        if not estimator.scene.camera.pinhole:
-            raise ValueError(f"{model}: its camera has a lens, which the detectors do not know; give a model of a pinhole")
-        baseline = Baseline(estimator.scene)
+        baseline = Baseline(estimator.ideal)
     except (ModelError, ValueError) as error:
         fail(error)
     answers: list[Answer] = []
