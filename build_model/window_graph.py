@@ -49,9 +49,10 @@ def _row_sums(g: GraphWriter, scene: Scene, tables: WindowTables, crop: str) -> 
 
 
 def _both_sides(g: GraphWriter, tables: WindowTables, pixels: str) -> str:
-    """J: the pixels with one below them, or below and beside."""
+    """J: the pixels with one below them, or below and beside. Of bools, since not every onnxruntime has Max and Min of bytes."""
     rows, columns = tables.window.shape
-    wide = g.node("Pad", "pixels_padded", pixels, g.whole("around", 0, 1, 1, 1))
+    lit = g.node("Cast", "pixels_lit", pixels, to=TensorProto.BOOL)
+    wide = g.node("Pad", "pixels_padded", lit, g.whole("around", 0, 1, 1, 1))
     beneath = [
         g.node(
             "Slice",
@@ -63,7 +64,8 @@ def _both_sides(g: GraphWriter, tables: WindowTables, pixels: str) -> str:
         )
         for shift in range(3)
     ]
-    return g.node("Min", "both_sides", pixels, g.node("Max", "beneath", *beneath))
+    beside = g.node("Or", "beside", beneath[0], beneath[2])
+    return g.node("And", "both_sides", lit, g.node("Or", "beneath", beside, beneath[1]))
 
 
 def _missed(g: GraphWriter, scene: Scene, tables: WindowTables, sums: str) -> str:

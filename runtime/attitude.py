@@ -182,6 +182,12 @@ class Turns:
         (cos_b, sin_b0), off_b = _middle(b, np.abs(b[0]) + np.abs(b[1]))
         return Turns(cos_a, sin_a, cos_b, sin_b0, off_a, off_b)
 
+    @staticmethod
+    def level(count: int, off_a: float, off_b: float) -> Turns:
+        """Of `count` sets whose sensor is not turned, but for so much at most."""
+        one, nothing = np.ones(count), np.zeros(count)
+        return Turns(one, nothing, one, nothing, np.full(count, off_a), np.full(count, off_b))
+
     @property
     def off(self) -> Floats:
         """The largest angle between one of a set's rotations and the one in the middle."""

@@ -11,6 +11,7 @@ is left of the entries within a box that is known to hold the state.
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -28,6 +29,7 @@ from runtime.model.entries import Entries
 from runtime.model.format import BOX_TENSORS, MASK_TENSORS, OVERFLOW, SPAN_TENSORS, ModelError
 from runtime.model.model_file import ModelFile, packaged_model, parse_model, read_model
 from runtime.model.session import check_interface, open_session, outputs_of, reason_of
+from runtime.on_sensor import refined
 from runtime.refine.refiner import Refiner
 from runtime.refine.regions import hulls, regions_of
 from runtime.refine.slices import covering, within
@@ -47,7 +49,7 @@ class Found:
     """What the model says of one frame: its outputs (models/README.md), `filtered` in the sensor's frame."""
 
     pixels: NDArray[np.uint8]
-    """The ideal frame: the sensor's own, or what was painted of it."""
+    """The sensor's frame, its own."""
     cell: int
     support: NDArray[np.int32]
     mismatch: NDArray[np.int32]
@@ -86,6 +88,7 @@ class Estimator:
         self.attitude = None if bounds is None else Attitude.between(bounds.roll_rad, bounds.yaw_rad)
         window = self._entries.window_and_beyond(REFINED_BEYOND_PX)
         self._refiner = Refiner(self.ideal, int(self._budgets["missed_budget"]), int(self._budgets["extra_budget"]), window)
+        self._sensor_refiner = Refiner(self.scene, self.missed_budget, -1, optics=self.sensor.optics)
         budgets = {"missed_budget": self.missed_budget, "extra_budget": self.extra_budget}
         self.assumed = tuple(assumptions(replace(self.scene, tolerance=replace(self.scene.tolerance, **budgets))))
         # The file's absolute path: whoever reads it again may do so after a change of folder.
@@ -111,6 +114,11 @@ class Estimator:
     def extra_budget(self) -> int:
         """e of Theorem B, or -1 where it is not used."""
         return int(self._budgets["extra_budget"])
+
+    @property
+    def beside_px(self) -> int:
+        """How far beside its place a pixel may fire: `line_px`, less the whole pixels of it that NN_F needs for the calibration."""
+        return max(self.scene.tolerance.line_px - math.ceil(self.metadata.get("calibration_shift_px", 0.0)), 0)
 
     @property
     def largest_missed_budget(self) -> int:
@@ -193,21 +201,20 @@ class Estimator:
         """
         own, turned = self._checked_frame(frame), None
         if attitude is None:
-            pixels = self.sensor.painted(own)
-            outputs = self.run_unchecked(pixels)
+            outputs = self.run_unchecked(self.sensor.painted(own))
         else:
             if not self.scene.calibration.exact:
                 raise ValueError("attitude: found a scene with a plus-minus in [calibration]; give that of roll and yaw with the attitude")
             if self.sensor.map is not None and self.missed_budget > 0:
                 raise ValueError(f"attitude: found missed_budget {self.missed_budget} behind a lens; load the model with 0")
-            pixels, seen = own, self._seen(prior, attitude)
+            seen = self._seen(prior, attitude)
             outputs, turned = started(self.sensor, self._entries, self._run_by_theorem_a, own, attitude, seen, self._refiner.window)
         overflow = bool(outputs.pop(OVERFLOW, False))
         cell, support, mismatch, passes, lower, upper, filtered, network_state = outputs.values()
         network = np.where(self.scene.domain.fixed, self.domain.lower, network_state)
-        if pixels is not own:
+        if self.sensor.map is not None and turned is None:
             filtered = own & self.sensor.seen_in(filtered.view(np.bool_))
-        return Found(pixels, int(cell), support, mismatch, passes, lower, upper, filtered, network, overflow, turned)
+        return Found(own, int(cell), support, mismatch, passes, lower, upper, filtered, network, overflow, turned)
 
     def _run_by_theorem_a(self, pixels: NDArray[np.uint8], met_by_one: int) -> dict[str, Any]:
         """`run_unchecked` of a painted frame, in which a missed pixel may spoil several; without Theorem B, which nobody vouches for."""
@@ -235,7 +242,12 @@ class Estimator:
         """
         cut = None if known is None else partial(within, self.ideal.camera, known=known)
         if found.turned is not None:
-            return found.turned.left(self._refiner, cut, refine)
+            return found.turned.left(self._sensor_refiner, cut, refine)
+        if self.sensor.optics is not None:
+            entries = self._entries.sets(found.passes)
+            entries = entries if cut is None else cut(entries)
+            lit = witnesses(found.pixels.view(np.bool_), self.beside_px)
+            return refined(self._sensor_refiner, lit, entries, cut is not None) if refine else entries
         frame, line_px = found.pixels.view(np.bool_), self.ideal.tolerance.line_px
         if refine and self._refiner.extra_budget >= 0 and line_px == 0:  # Theorem B's claims are made at tolerance 0 only
             return refined_by_cell(self._refiner, self._entries, found.passes, frame, cut)

@@ -12,6 +12,7 @@ from runtime.ideal import ideal_scene
 from runtime.image import dilated
 from runtime.outline import Outline
 from runtime.painting import Painting, ideal_pixels_a_pixel
+from runtime.refine.optics import Optics
 from runtime.scene import Scene
 from runtime.sensor_map import SensorMap, runway_beyond
 
@@ -54,6 +55,11 @@ class Sensor:
     def runway_beyond(self) -> bool:
         """True if a point of the runway may lie beyond the ideal frame, in some state of the domain, where a turned sensor may show it."""
         return runway_beyond(self.ideal)
+
+    @cached_property
+    def optics(self) -> Optics | None:
+        """What its lens does at the borders of its rows; None for a pinhole."""
+        return Optics.of(self.scene)
 
     def painted(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The ideal frame of a sensor's frame, uint8 of {0, 1} both: as it is, or painted outward.

@@ -93,11 +93,7 @@ class SensorMap:
         """
         camera, off = scene.camera, scene.calibration
         lens = lens_of(camera, off)
-        sides = np.arange(camera.width + 1.0), np.arange(camera.height + 1.0)
-        columns, rows = np.meshgrid(*sides)
-        rays = _rays(camera, off, lens, columns, rows)
-        for array in rays:
-            array.flags.writeable = False
+        rays = corner_rays(camera, lens, off)
         still = SensorMap(camera, ideal_camera(scene), off, lens, None, rays)
         if turn is None and (off.roll_rad or off.yaw_rad):
             turn = (-off.roll_rad, off.roll_rad), (-off.yaw_rad, off.yaw_rad)
@@ -181,6 +177,15 @@ def lens_of(camera: Camera, off: Calibration) -> Lens:
     across = (max(abs(camera.u0), abs(camera.width - camera.u0)) + off.principal_px) / (camera.focal_u_px * zoom)
     down = (max(abs(camera.v0), abs(camera.height - camera.v0)) + off.principal_px) / (camera.focal_v_px * zoom)
     return Lens.of(camera.distortion, math.hypot(across, down) * (1 + ROUNDING_SHARE))
+
+
+def corner_rays(camera: Camera, lens: Lens, off: Calibration | None = None) -> tuple[Floats, Floats, Floats]:
+    """Of every corner of the sensor's pixels, (height + 1, width + 1) each: the lens's ray (s, t), and how far from it the true one is."""
+    columns, rows = np.meshgrid(np.arange(camera.width + 1.0), np.arange(camera.height + 1.0))
+    rays = _rays(camera, off or Calibration(), lens, columns, rows)
+    for array in rays:
+        array.flags.writeable = False
+    return rays
 
 
 def ideal_camera(scene: Scene) -> Camera:

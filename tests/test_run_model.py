@@ -711,6 +711,42 @@ def test_readings_are_moved_to_the_instant_between_them(tmp_path):
     assert readings.level(0.0, 0.0)
 
 
+def test_all_readings_since_the_last_window_bound_the_pitch() -> None:
+    """Each within its plus-minus, moved by the bounds on the rate or as a gyroscope has it; where they contradict each other, either."""
+    rows = [(0, 0.5, 0.01), (10_000, 0.508, 0.01), (20_000, 0.503, 0.01), (30_000, 0.499, 0.01), (40_000, 0.9, 0.01)]
+    times, theta, plus_minus = np.array(rows).T
+    readings = AttitudeReadings(times, np.outer(-theta, [0, 1, 0]), np.outer(plus_minus, [0, 1, 0]))
+    domain, motion = Box(np.full(4, -9.0), np.full(4, 9.0)), Motion([-0.1] * 4, [0.2] * 4)
+    near = {"abs": 1e-12}
+    beside = readings.prior(25_000, motion, domain)
+    assert (beside.lower[0], beside.upper[0]) == (pytest.approx(0.499 - 0.01 - 0.001, **near), pytest.approx(0.503 + 0.01 + 0.001, **near))
+    since = readings.prior(25_000, motion, domain, 5_000)
+    assert (since.lower[0], since.upper[0]) == (pytest.approx(0.508 - 0.01 - 0.0015, **near), pytest.approx(0.499 + 0.01 + 0.0005, **near))
+    turned = readings.prior(25_000, motion, domain, 5_000, lambda since_us, until_us: (0.0, 1e-8 * (until_us - since_us)))
+    assert (turned.lower[0], turned.upper[0]) == (pytest.approx(0.508 - 0.01, **near), pytest.approx(0.499 + 0.01, **near))
+    wrong = readings.prior(35_000, motion, domain, 5_000)
+    assert (wrong.lower[0], wrong.upper[0]) == (pytest.approx(0.499 - 0.01 - 0.0005, **near), pytest.approx(0.9 + 0.01 + 0.0005, **near))
+    alone = readings.prior(25_000, motion, domain, 30_000)
+    assert (alone.lower[0], alone.upper[0]) == (pytest.approx(0.503 - 0.01 - 0.0005, **near), pytest.approx(0.499 + 0.01 + 0.0005, **near))
+
+
+def test_readings_of_a_pitch_hold_it_whatever_was_the_last_window() -> None:
+    """The truth stays inside, at rates on either bound, readings off by their whole plus-minus; more readings never make it wider."""
+    rng, domain = np.random.default_rng(5), Box(np.full(4, -9.0), np.full(4, 9.0))
+    motion, times = Motion([-0.3] * 4, [0.1] * 4), np.arange(0.0, 300_000, 7_000)
+    for _ in range(200):
+        rates = rng.choice([-0.3, 0.1, -0.1], len(times))
+        theta = 0.5 + np.concatenate([[0.0], np.cumsum(rates[:-1] * np.diff(times) / 1e6)])
+        off = rng.choice([-1, 1, 0.3], len(times)) * (1 - 1e-12)
+        readings = AttitudeReadings(times, np.outer(-(theta + 0.004 * off), [0, 1, 0]), np.full((len(times), 3), 0.004))
+        now_us = float(rng.uniform(times[0], times[-1]))
+        boxes = [readings.prior(now_us, motion, domain, now_us - before_us) for before_us in (0, 20_000, 200_000)]
+        truth = np.interp(now_us, times, theta)
+        assert all(box.lower[0] <= truth <= box.upper[0] for box in boxes)
+        sizes = [box.upper[0] - box.lower[0] for box in boxes]
+        assert sizes == sorted(sizes, reverse=True)
+
+
 def test_the_chart_shows_both_bands():
     scene, history = Estimator.load(MODEL).scene, History()
     for number, state in enumerate(STATES):

@@ -17,10 +17,11 @@ from turned_state import TurnedState
 from build_model.export import NO_ESTIMATOR, export_model
 from runtime import Attitude, Box, Estimator, Motion, Outcome, Scene, Tracker
 from runtime.attitude import Turns
+from runtime.on_sensor import grouped
 from runtime.painting import Painted
 from runtime.scene import AttitudeBounds, Axis, Camera, Distortion
 from runtime.sensor import Sensor
-from runtime.turned import Bin, bins_of, grouped, joined, met_by_one, turned_map
+from runtime.turned import Bin, bins_of, joined, met_by_one, turned_map
 
 EstimatorOf = Callable[..., Estimator]
 SCALES = {"paper": PAPER, "strip": STRIP, "airport": AIRPORT}
@@ -116,7 +117,7 @@ def test_hulls_of_entries_hold_them(estimator_of: EstimatorOf) -> None:
     state = drawn(FREE_X, rng, 0.05)
     found = free.find(image(FREE_X, state), state.attitude(rng, 0.004, 0.004))
     assert found.turned is not None
-    entries = joined(*(sets for _, sets in found.turned.parts))
+    entries = joined(*found.turned.parts)
     few = grouped(entries, 20)
     assert len(few) < len(entries)
     for name in ("theta", "x", "y", "z", "roll", "yaw"):

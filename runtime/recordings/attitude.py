@@ -6,6 +6,7 @@ that is mounted otherwise is turned is in `runtime.attitude`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -65,6 +66,11 @@ def _joined(angles: list[Angle]) -> Angle:
     return min(low for low, _ in angles), max(high for _, high in angles)
 
 
+def _met(angles: list[Angle]) -> Angle:
+    """What all of them allow; inverted where they contradict each other."""
+    return max(low for low, _ in angles), min(high for _, high in angles)
+
+
 @dataclass(frozen=True)
 class AttitudeReadings:
     """Readings at ascending times (n,) us: angles and plus-minus, (n, 3) each, of roll, pitch and yaw, rad."""
@@ -87,8 +93,7 @@ class AttitudeReadings:
 
         Each interval holds what either reading allows; it is infinite where the bounds on a rate are.
         """
-        before = max(int(np.searchsorted(self.time_us, time_us, side="right")) - 1, 0)
-        after = min(int(np.searchsorted(self.time_us, time_us)), len(self.time_us) - 1)
+        before, after = self._around(time_us)
         pitch_rates = float(motion.rate_lower[0]), float(motion.rate_upper[0])  # of the pitch down
         roll, down, yaw = (
             _joined([self._angle(row, time_us, place, sign, rates) for row in (before, after)])
@@ -96,9 +101,43 @@ class AttitudeReadings:
         )
         return Angles(roll, down, yaw)
 
-    def prior(self, time_us: float, motion: Motion, domain: Box) -> Box:
-        """The domain with theta as the readings allow it of a camera along the aircraft's axis; the domain's where they tell nothing."""
-        return _with_pitch(domain, self.at(time_us, motion, Turning()).pitch_down)
+    def prior(
+        self,
+        time_us: float,
+        motion: Motion,
+        domain: Box,
+        since_us: float | None = None,
+        turned: Callable[[float, float], Angle] | None = None,
+    ) -> Box:
+        """The domain with theta as the readings allow it of a camera along the aircraft's axis; the domain's where they tell nothing.
+
+        By default theta lies in what either of the readings beside the instant, before and after it, allows, moved to it by the bounds on
+        its rate. With `since_us` it lies in what all readings allow from there on, the one before and the one after that time included:
+        each holds what theta was at its own time, and `turned` bounds how far theta moves from one time to a later one, by default by the
+        bounds on its rate. Where they contradict each other, which proves one of them wrong, those beside the instant stand.
+        """
+        before, after = self._around(time_us)
+        pitch = _joined([self._theta(row, time_us, motion, turned) for row in (before, after)])
+        if since_us is not None:
+            first = self._around(min(since_us, time_us))[0]
+            met = _met([self._theta(row, time_us, motion, turned) for row in range(first, after + 1)])
+            pitch = met if met[0] <= met[1] else pitch
+        return _with_pitch(domain, pitch)
+
+    def _around(self, time_us: float) -> tuple[int, int]:
+        """The rows of the last reading until a time and of the first one from it on; the first or last of all where there is none."""
+        before = max(int(np.searchsorted(self.time_us, time_us, side="right")) - 1, 0)
+        return before, min(int(np.searchsorted(self.time_us, time_us)), len(self.time_us) - 1)
+
+    def _theta(self, row: int, time_us: float, motion: Motion, turned: Callable[[float, float], Angle] | None) -> Angle:
+        """The interval of theta at an instant by one reading alone, rounded outward."""
+        then_us = float(self.time_us[row])
+        if turned is None or then_us == time_us:
+            return self._angle(row, time_us, 1, -1, (float(motion.rate_lower[0]), float(motion.rate_upper[0])))
+        low, high = turned(then_us, time_us) if then_us < time_us else tuple(-side for side in reversed(turned(time_us, then_us)))
+        down, plus_minus = -self.angles[row, 1], self.plus_minus[row, 1]
+        terms = abs(down) + plus_minus + max(abs(low), abs(high))
+        return float(lowered(down - plus_minus + low, terms)), float(raised(down + plus_minus + high, terms))
 
     def _angle(self, row: int, time_us: float, place: int, sign: int, rates: Angle) -> Angle:
         """The interval of an angle, of pitch with its sign turned, at an instant by one reading alone, rounded outward."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +78,9 @@ class Follower:
         if self.readings is None:
             return None, None
         if not self.turned:
-            return None, self.readings.prior(instant_us, self.tracker.motion, estimator.domain)
+            since_us = self.latest_us if np.isfinite(self.latest_us) else None
+            turned = None if self.gyroscope is None else partial(self.gyroscope.turned, motion=self.tracker.motion)
+            return None, self.readings.prior(instant_us, self.tracker.motion, estimator.domain, since_us, turned)
         angles = self.readings.at(instant_us, self.tracker.motion, Turning.of(estimator.scene))
         try:
             return angles.of_camera(estimator.scene.camera.mount or Mount(), estimator.domain)

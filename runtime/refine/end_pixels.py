@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.refine.interval import Floats, Interval
+from runtime.refine.sensor_borders import SensorBorders
 from runtime.refine.sight import Sight
 from runtime.state_set import StateSet, scale_ratio, tangent_of_row
 
@@ -18,7 +19,7 @@ def offsets_at_ends(sets: StateSet, sight: Sight) -> Interval:
     """
     borders, u0 = sight.borders, sight.scene.camera.u0
     complete = sight.missed.left == 0
-    if sets.roll is not None or not complete.any():
+    if isinstance(borders, SensorBorders) or not complete.any():
         return np.full(borders.near[0].shape, -np.inf), np.full(borders.near[0].shape, np.inf)
     row = np.floor(np.array([borders.far[1], borders.near[0]]))  # (ends, markings, sets), as all that follows
     slow, fast = _ratios(sets, sight, row)
