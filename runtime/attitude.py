@@ -65,6 +65,13 @@ class Attitude:
             halves.append(float(raised(max(high - middle, middle - low), abs(low) + abs(high))) if high > low else 0.0)
         return Attitude(middles[0], middles[1], halves[0], halves[1])
 
+    def wider(self, roll_rad: float, yaw_rad: float) -> Attitude:
+        """The same readings with so much more of a plus-minus."""
+        if roll_rad == 0 and yaw_rad == 0:
+            return self
+        roll, yaw = self.roll_plus_minus_rad + roll_rad, self.yaw_plus_minus_rad + yaw_rad
+        return Attitude(self.roll_rad, self.yaw_rad, float(raised(roll, roll)), float(raised(yaw, yaw)))
+
     @property
     def roll(self) -> tuple[float, float]:
         """The least and the largest roll, rad."""

@@ -88,7 +88,7 @@ class Estimator:
         self.attitude = None if bounds is None else Attitude.between(bounds.roll_rad, bounds.yaw_rad)
         window = self._entries.window_and_beyond(REFINED_BEYOND_PX)
         self._refiner = Refiner(self.ideal, int(self._budgets["missed_budget"]), int(self._budgets["extra_budget"]), window)
-        self._sensor_refiner = Refiner(self.scene, self.missed_budget, -1, optics=self.sensor.optics)
+        self._sensor_refiner = Refiner(self.scene, self.missed_budget, -1)
         budgets = {"missed_budget": self.missed_budget, "extra_budget": self.extra_budget}
         self.assumed = tuple(assumptions(replace(self.scene, tolerance=replace(self.scene.tolerance, **budgets))))
         # The file's absolute path: whoever reads it again may do so after a change of folder.
@@ -180,7 +180,7 @@ class Estimator:
         Theorem A alone is used. Raises `FrameError` for any other frame and ValueError for a proposal of another shape.
         """
         state = None if proposal is None else self._checked_proposal(proposal)
-        attitude = attitude or self.attitude
+        attitude = self.known_attitude(attitude)
         found = self.find(frame, attitude, prior)
         if prior is None:
             return self._alone(found, refine, state)
@@ -193,22 +193,22 @@ class Estimator:
         assumed = (*self.assumed_of(found), prior_assumption(prior.lower, prior.upper))
         return self.concluded(found, regions, assumed, otherwise, state, left)
 
+    def known_attitude(self, told: Attitude | None) -> Attitude | None:
+        """Roll and yaw of the camera: as told or by the scene, and what [calibration] has of a plus-minus besides; None if level."""
+        told, off = told or self.attitude, self.scene.calibration
+        return None if told is None else told.wider(off.roll_rad, off.yaw_rad)
+
     def find(self, frame: NDArray, attitude: Attitude | None = None, prior: Box | None = None) -> Found:
         """What the model says of a frame; of one of a rolled or yawed camera, at the pitches that a prior allows.
 
-        Raises `FrameError` as `estimate` does, and ValueError for an attitude with a plus-minus in [calibration], or with a
-        budget of missed pixels behind a lens.
+        `attitude`: as `known_attitude` has it. Raises `FrameError` as `estimate` does.
         """
         own, turned = self._checked_frame(frame), None
         if attitude is None:
             outputs = self.run_unchecked(self.sensor.painted(own))
         else:
-            if not self.scene.calibration.exact:
-                raise ValueError("attitude: found a scene with a plus-minus in [calibration]; give that of roll and yaw with the attitude")
-            if self.sensor.map is not None and self.missed_budget > 0:
-                raise ValueError(f"attitude: found missed_budget {self.missed_budget} behind a lens; load the model with 0")
-            seen = self._seen(prior, attitude)
-            outputs, turned = started(self.sensor, self._entries, self._run_by_theorem_a, own, attitude, seen, self._refiner.window)
+            seen, window = self._seen(prior, attitude), self._refiner.window
+            outputs, turned = started(self.sensor, self._entries, self._run_by_theorem_a, own, attitude, seen, self.beside_px, window)
         overflow = bool(outputs.pop(OVERFLOW, False))
         cell, support, mismatch, passes, lower, upper, filtered, network_state = outputs.values()
         network = np.where(self.scene.domain.fixed, self.domain.lower, network_state)
@@ -243,11 +243,11 @@ class Estimator:
         cut = None if known is None else partial(within, self.ideal.camera, known=known)
         if found.turned is not None:
             return found.turned.left(self._sensor_refiner, cut, refine)
-        if self.sensor.optics is not None:
+        if self.sensor.optics:
             entries = self._entries.sets(found.passes)
             entries = entries if cut is None else cut(entries)
             lit = witnesses(found.pixels.view(np.bool_), self.beside_px)
-            return refined(self._sensor_refiner, lit, entries, cut is not None) if refine else entries
+            return refined(self._sensor_refiner, self.sensor.optics, lit, entries, cut is not None) if refine else entries
         frame, line_px = found.pixels.view(np.bool_), self.ideal.tolerance.line_px
         if refine and self._refiner.extra_budget >= 0 and line_px == 0:  # Theorem B's claims are made at tolerance 0 only
             return refined_by_cell(self._refiner, self._entries, found.passes, frame, cut)

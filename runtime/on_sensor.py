@@ -11,9 +11,10 @@ from runtime.motion import tilted
 from runtime.refine.interval import Bits
 from runtime.refine.lit_pixels import LitPixels
 from runtime.refine.optics import Optics
-from runtime.refine.refiner import Refiner
+from runtime.refine.refiner import Refiner, joined
 from runtime.refine.sensor_borders import SensorBorders
 from runtime.refine.slices import INTERVALS, rereferenced
+from runtime.rounding import lowered, raised
 from runtime.scene import Scene
 from runtime.state_set import StateSet
 
@@ -27,18 +28,38 @@ MOST_DOUBLINGS = 6
 """How often bins of scale and of reference rows are doubled for that."""
 
 
-def refined(refiner: Refiner, lit: Bits, entries: StateSet, narrowed: bool) -> StateSet:
+def refined(refiner: Refiner, parts: tuple[Optics, ...], lit: Bits, entries: StateSet, narrowed: bool) -> StateSet:
     """What of the entries is consistent with a frame of the sensor, (height, width), dilated by the tolerance; by Theorem A alone.
 
-    The refiner is of the sensor's scene, with its optics; `narrowed` as it has it.
+    The refiner is of the sensor's scene, `parts` are of its optics; `narrowed` as the refiner has it. A state is consistent if one of the
+    parts allows it.
     """
     if len(entries) == 0:
         return entries
-    few, camera, tilt = grouped(entries, MOST_ENTRIES), refiner.scene.camera, 0.0 if refiner.optics is None else refiner.optics.tilt
-    seen = tilted(camera, few, tilt) if tilt else few
-    sensor = replace(refiner, extra_budget=-1, window=window_of(refiner.scene, seen, refiner.optics))
+    few = grouped(entries, MOST_ENTRIES)
+    refiner = replace(refiner, extra_budget=-1)
+    if not parts:
+        return replace(refiner, window=window_of(refiner.scene, few, None)).refine(lit, few, narrowed=narrowed)
+    return joined(*(_refined_by(refiner, optics, lit, few, narrowed) for optics in parts))
+
+
+def _refined_by(refiner: Refiner, optics: Optics, lit: Bits, entries: StateSet, narrowed: bool) -> StateSet:
+    """The same by one part: with its focal lengths, of which scales are multiples, and the pitch that is seen."""
+    scene, zoom = replace(refiner.scene, camera=optics.camera), optics.camera.focal_u_px / refiner.scene.camera.focal_u_px
+    seen = zoomed(entries, zoom)
+    seen = tilted(scene.camera, seen, optics.tilt) if optics.tilt else seen
+    sensor = replace(refiner, scene=scene, optics=optics, window=window_of(scene, seen, optics))
     left = sensor.refine(lit, seen, narrowed=narrowed)
-    return within_hull(tilted(camera, left, tilt), few) if tilt else left
+    left = tilted(scene.camera, left, optics.tilt) if optics.tilt else left
+    return within_hull(zoomed(left, 1 / zoom), entries)
+
+
+def zoomed(sets: StateSet, by: float) -> StateSet:
+    """The sets with scales, px per metre, for focal lengths that are so many times as long."""
+    if by == 1:
+        return sets
+    scale = sets.scale * by
+    return replace(sets, scale=np.stack([lowered(scale[:, 0], scale[:, 0]), raised(scale[:, 1], scale[:, 1])], axis=-1))
 
 
 def within_hull(sets: StateSet, others: StateSet) -> StateSet:

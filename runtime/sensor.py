@@ -57,9 +57,9 @@ class Sensor:
         return runway_beyond(self.ideal)
 
     @cached_property
-    def optics(self) -> Optics | None:
-        """What its lens does at the borders of its rows; None for a pinhole."""
-        return Optics.of(self.scene)
+    def optics(self) -> tuple[Optics, ...]:
+        """What its lens does at the borders of its rows, for parts of its calibration's plus-minus; none for a pinhole known exactly."""
+        return Optics.parts_of(self.scene)
 
     def painted(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The ideal frame of a sensor's frame, uint8 of {0, 1} both: as it is, or painted outward.

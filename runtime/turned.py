@@ -31,7 +31,7 @@ from runtime.refine.regions import regions_of
 from runtime.refine.witnesses import witnesses
 from runtime.scene import Camera, Scene
 from runtime.sensor import Sensor
-from runtime.sensor_map import SensorMap, Turn
+from runtime.sensor_map import LARGEST_ANGLE_RAD, SensorMap, Turn
 from runtime.state_set import StateSet
 
 Floats = NDArray[np.float64]
@@ -99,7 +99,7 @@ class TurnedStart:
     def left(self, refiner: Refiner, cut: Callable[[StateSet], StateSet] | None, refine: bool) -> StateSet:
         """What of the entries is consistent with the sensor's frame, and with what is known besides, to which `cut` cuts."""
         together = joined(*(sets if cut is None else cut(sets) for sets in self.parts))
-        return refined(refiner, self.lit, together, cut is not None) if refine else together
+        return refined(refiner, self.sensor.optics, self.lit, together, cut is not None) if refine else together
 
     def regions(self, left: StateSet, domain: Box, parts: Sequence[NDArray[np.int64]] | None) -> tuple[Box, ...]:
         """Boxes around parts of what is left, by the camera's pitch; `domain` is of the pitch that the ideal frame shows."""
@@ -126,15 +126,17 @@ def started(
     pixels: NDArray[np.uint8],
     attitude: Attitude,
     seen: Box | None,
+    beside_px: int,
     window: Window,
 ) -> tuple[dict[str, Any], TurnedStart]:
     """NN_F's outputs on the painted frames of all bins, taken together, `filtered` in the sensor's frame, and what of the bank passes.
 
     `run`: NN_F on a frame, with the budget of missed pixels times a number. `pixels`: the sensor's frame. `seen`: a box that holds the
-    state, with the pitch that the ideal frame shows; None if there is none. `window`: of the ideal frame, what is looked at.
+    state, with the pitch that the ideal frame shows; None if there is none. `beside_px`: how far beside its place a pixel may fire.
+    `window`: of the ideal frame, what is looked at.
     """
     scene = sensor.ideal
-    lit = witnesses(pixels.view(np.bool_), sensor.scene.tolerance.line_px)
+    lit = witnesses(pixels.view(np.bool_), beside_px)
     if seen is None:
         outputs = {**run(np.zeros(scene.camera.shape, dtype=np.uint8), 1), "filtered": np.zeros_like(pixels)}
         return outputs, TurnedStart(sensor, attitude, lit, (_with(entries.all[:0], attitude),))
@@ -144,7 +146,7 @@ def started(
         turns = each.turns
         map_of_bin = turned_map(sensor, turns)
         painted = Painted.of(lit, map_of_bin, sensor.outline, window)
-        outputs = run(painted.ideal, met_by_one(scene, turns))
+        outputs = run(painted.ideal, met_by_one(scene, turns, sensor.still))
         outputs["filtered"] = painted.within(outputs["filtered"].view(np.bool_), pixels)
         if sensor.runway_beyond:
             outputs["filtered"] |= pixels & sensor.outline.not_within(map_of_bin)
@@ -191,24 +193,44 @@ def _together(before: dict[str, Any], outputs: dict[str, Any]) -> dict[str, Any]
     return both
 
 
-def met_by_one(scene: Scene, turns: Turns) -> int:
+def met_by_one(scene: Scene, turns: Turns, still: SensorMap | None = None) -> int:
     """Most pixels of the ideal frame that all markings together can meet inside what one pixel of the sensor shows.
 
     With S' = cos(a) S + sin(a) T, d(X/Z)/dS' = 1/Z^2 and d(Y/Z) = dT'/Z - Y sin(b) dS'/Z^2. What spans w px meets at most floor(w) + 2
-    columns or rows, and a straight line in so many columns and rows one pixel fewer than they are together.
+    columns or rows, and a straight line in so many columns and rows one pixel fewer than they are together. `still`: the sensor's map,
+    where that is no pinhole with the ideal frame's own focal lengths.
     """
     camera = scene.camera
     cos_a, sin_a, sin_b = (float(np.abs(side[0])) + float(off[0]) for side, off in _sizes(turns))
-    sides = np.abs([camera.u0, camera.width - camera.u0]).max() / camera.focal_u_px
-    heights = np.abs([camera.v0, camera.height - camera.v0]).max() / camera.focal_v_px
+    sides, heights, wide, tall = _of_a_pixel(camera, turns, still)
     aside, down = cos_a * sides + sin_a * heights, cos_a * heights + sin_a * sides
     ahead = float(turns.cos_b[0] - turns.off_b[0]) - sin_b * aside
     if ahead <= 0:
         return camera.width * camera.height
-    across, fall = cos_a / camera.focal_u_px + sin_a / camera.focal_v_px, cos_a / camera.focal_v_px + sin_a / camera.focal_u_px
+    across, fall = cos_a * wide + sin_a * tall, cos_a * tall + sin_a * wide
     spans = camera.focal_u_px * across / ahead**2, camera.focal_v_px * (fall / ahead + down * sin_b * across / ahead**2)
     columns, rows = (math.floor(span * (1 + 2.0**-30)) + 2 for span in spans)
     return min(columns * rows, len(scene.runway.markings) * (columns + rows - 1))
+
+
+def _of_a_pixel(camera: Camera, turns: Turns, still: SensorMap | None) -> tuple[float, float, float, float]:
+    """Largest |S| and |T| of rays that the ideal frame can show, and the width and height in rays of what a pixel shows.
+
+    A step of h in the sensor's frame is J^-1 h, J the lens's Jacobian with eigenvalues from l to L: along itself at most h/l, across
+    h (1/l - 1/L)/2.
+    """
+    sides = float(np.abs([camera.u0, camera.width - camera.u0]).max() / camera.focal_u_px)
+    heights = float(np.abs([camera.v0, camera.height - camera.v0]).max() / camera.focal_v_px)
+    wide, tall = 1 / camera.focal_u_px, 1 / camera.focal_v_px
+    if still is None or (still.lens.model is None and still.calibration.exact):
+        return sides, heights, wide, tall
+    zoom = 1 / (1 - still.calibration.focal_relative)
+    angle = math.atan(math.hypot(sides, heights)) + math.asin(min(float(np.abs(turns.sin_b[0]) + turns.off_b[0]), 1.0))
+    farthest = min(math.tan(angle), still.lens.radius) if angle < LARGEST_ANGLE_RAD else still.lens.radius
+    step = zoom * max(wide, tall) / still.lens.stretch
+    least = still.lens.stretch_within(farthest + 2 * step) if farthest + 2 * step < still.lens.radius else still.lens.stretch
+    along, beside = zoom / least, zoom * (1 / least - 1 / still.lens.largest_scale) / 2
+    return farthest, farthest, along * wide + beside * tall, along * tall + beside * wide
 
 
 def _sizes(turns: Turns) -> tuple[tuple[Floats, Floats], ...]:

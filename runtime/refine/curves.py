@@ -36,6 +36,8 @@ class Met:
     shown: Interval
     """Of D_x."""
     known: Bits
+    spans: Bits
+    """True where the lines of all states meet the border within the stretch, be it beyond their markings' ends."""
 
 
 @dataclass(frozen=True)
@@ -90,7 +92,20 @@ class Curves:
         beside = (across + off) * half + (np.abs(mixed) + off) * reach
         shown = self.optics.lens.distorted(s, t)[0]
         beside += self.optics.beside_tilt(turns, s, t, around)[0] + self.optics.lens.rounding + ROUNDING_SHARE * np.abs(shown)
-        return Met((low, high), (t - reach, t + reach), (shown - beside, shown + beside), known)
+        # Between two borders a curve leaves what lies between where it meets them by less than it bends over two rows' way.
+        way = 2 * (1 + np.maximum(*np.abs(self.lines.slopes))) / (self.optics.camera.focal_v_px * self.rise[:, None])
+        beside += self.optics.lens.largest_bend * way * way / 8
+        return Met((low, high), (t - reach, t + reach), (shown - beside, shown + beside), known, known & self._spanned(border))
+
+    def _spanned(self, border: Floats) -> Bits:
+        """True where both ends of the stretches of all lines lie on either side of a border, (markings, rows, sets)."""
+        turns, spanned = self.lines.view.turns, np.ones(1, dtype=bool)
+        off = self.optics.border(border) + self._rounding(border)
+        for side, below in ((self.start[:, None], True), (self.stop[:, None], False)):
+            (low, high), known = self.lines.at(side)
+            shown, within = shown_rows(self.optics, turns, (low - self.margin, high + self.margin), (side, side))
+            spanned = spanned & known & within & (shown[1] <= border - off if below else shown[0] >= border + off)
+        return spanned
 
     def _found(self, border: Floats) -> Floats:
         """About the T at which the line in the middle meets each border, within the stretch, (markings, rows, sets)."""

@@ -14,12 +14,15 @@ from numpy.typing import NDArray
 
 from runtime.attitude import Turns
 from runtime.lens import LARGEST_RADIUS, Lens
-from runtime.refine.interval import Bits, Floats
+from runtime.refine.interval import Bits, Floats, Interval
 from runtime.rounding import ROUNDING_SHARE
 from runtime.scene import Calibration, Camera, Scene
 from runtime.sensor_map import corner_rays, lens_of
 from runtime.state_set import StateSet
 
+ZOOMED_PX = 0.2
+"""A plus-minus of the focal lengths is cut into parts, up to `MOST_PARTS`, of which none moves a corner of the frame by much more."""
+MOST_PARTS = 4
 ROUNDED_DERIVATIVE = 2.0**-30
 """Covers what rounding does to a lens's derivatives."""
 
@@ -43,6 +46,22 @@ class Stretch:
 
 
 @dataclass(frozen=True)
+class Patch:
+    """Patches of the frame between two columns and two rows, in rays (S, T): left and right edges, each by its upper and lower end."""
+
+    left: list[tuple[Floats, Floats]]
+    right: list[tuple[Floats, Floats]]
+    off: Floats
+    """How far a point of an edge may be from the segment between its ends."""
+    middle: tuple[Floats, Floats]
+    reach: Floats
+    """How far any point of the patch is from `middle` at most."""
+    down: Floats
+    """And how far along T."""
+    known: Bits
+
+
+@dataclass(frozen=True)
 class Optics:
     """A sensor's lens, and the rays of the corners of its pixels, row by row, flat."""
 
@@ -56,14 +75,28 @@ class Optics:
     """Bound on the way in rays from the first corner of a row to each, along the border."""
 
     @staticmethod
-    def of(scene: Scene) -> Optics | None:
-        """The optics of a scene's sensor; None for a pinhole that is known exactly.
+    def parts_of(scene: Scene) -> tuple[Optics, ...]:
+        """The optics of a scene's sensor, its plus-minus of the focal lengths cut into parts; none for a pinhole that is known exactly.
 
         Raises `SceneError` for a lens that folds within the frame.
         """
         camera, off = scene.camera, scene.calibration
         if camera.pinhole and off.exact:
-            return None
+            return ()
+        moved_px = off.focal_relative * math.hypot(camera.width, camera.height)
+        count = min(math.ceil(moved_px / ZOOMED_PX), MOST_PARTS) if moved_px > 0 else 1
+        parts = []
+        for number in range(count):
+            middle = 1 + off.focal_relative * ((2 * number + 1) / count - 1)
+            focal_px = camera.focal_u_px * middle, camera.focal_v_px * middle
+            narrower = replace(off, focal_relative=off.focal_relative / (count * middle) * (1 + ROUNDING_SHARE))
+            zoomed = replace(camera, focal_px=focal_px, focal_length_m=None, pixel_pitch_m=None) if count > 1 else camera
+            parts.append(Optics.of(zoomed, narrower))
+        return tuple(parts)
+
+    @staticmethod
+    def of(camera: Camera, off: Calibration) -> Optics:
+        """The optics of a sensor that may be off by so much. Raises `SceneError` for a lens that folds within the frame."""
         lens = lens_of(camera, off)
         if lens.model is None:
             lens = replace(lens, radius=LARGEST_RADIUS)
@@ -87,8 +120,8 @@ class Optics:
         return sets.turns if self.tilt == 0 else Turns.of(sets.theta + np.array([-self.tilt, self.tilt]), sets.roll, sets.yaw)
 
     def off(self, turns: Turns) -> tuple[Floats, ...]:
-        """How far a, b, g, Q_u and Q_v may be from their middles, (sets,) or (1,) each."""
-        return turns.off_a, turns.off_b, *(np.full(1, side) for side in self.swings)
+        """How far a, b, g, Q_u and Q_v may be from their middles, (sets,) each."""
+        return turns.off_a, turns.off_b, *(np.full(len(turns.off_a), side) for side in self.swings)
 
     def moved(self, s: Floats, t: Floats, reach: Floats) -> Floats:
         """How far the calibration's plus-minus may move the rays within `reach` of these, their places in the frame given."""
@@ -149,6 +182,25 @@ class Optics:
         off = np.where(known, off, 0.0)
         reach = np.abs(self.way.take(right) - self.way.take(left)) / 2 * (1 + ROUNDED_DERIVATIVE) + off
         return Stretch((s.take(left), t.take(left)), (s.take(right), t.take(right)), off, reach, known)
+
+    def patch(self, columns: Interval, rows: Interval) -> Patch:
+        """Of what the frame shows between two columns and two rows that are at most one apart, each of any one shape."""
+        camera, known = self.camera, np.logical_and.reduce([np.isfinite(side) for side in (*columns, *rows)])
+        u = [(np.where(known, side, camera.u0) - camera.u0) / camera.focal_u_px for side in columns]
+        v = [(np.where(known, side, camera.v0) - camera.v0) / camera.focal_v_px for side in rows]
+        found = [[self.lens.undistorted(across, down) for down in v] for across in u]
+        off = np.maximum.reduce([corner[2] for side in found for corner in side])
+        known &= np.isfinite(off)
+        s, t, away = self.lens.undistorted((u[0] + u[1]) / 2, (v[0] + v[1]) / 2)
+        wide, tall = np.abs(u[1] - u[0]) / 2, np.abs(v[1] - v[0]) / 2
+        stretch = self.lens.stretches_around(np.sqrt(s * s + t * t), float(np.max(wide + tall, initial=0.0)) / self.lens.stretch)
+        known &= np.isfinite(away)
+        bow = self.lens.largest_bend / stretch**3 * tall**2 / 2
+        off = np.where(known, off + away + bow, 0.0) * (1 + ROUNDED_DERIVATIVE) + ROUNDING_SHARE
+        reach, beside = (wide + tall) / stretch, wide * (1 / stretch - 1 / self.lens.largest_scale) / 2
+        reach, down = (side * (1 + ROUNDED_DERIVATIVE) + off for side in (reach, tall / stretch + beside))
+        left, right = ([(corner[0], corner[1]) for corner in side] for side in found)
+        return Patch(left, right, off, (s, t), reach, down, known)
 
     def _place(self, column: Floats, row: Floats) -> NDArray[np.int64]:
         """Where a corner stands in the tables; -1 where it is no corner of the frame."""

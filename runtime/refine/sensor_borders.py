@@ -33,7 +33,7 @@ from runtime.refine.curves import Curves, Met, shown_rows
 from runtime.refine.interval import Bits, Floats, Interval
 from runtime.refine.lit_pixels import LitPixels
 from runtime.refine.optics import Optics, Stretch
-from runtime.refine.unknowns import Unknowns
+from runtime.refine.unknowns import Moves, Unknowns
 from runtime.refine.view import LEAST_DEPTH, ROUNDED_SWAY, Lines, Sway, View
 from runtime.rounding import ROUNDING_SHARE, above, below, column_margin_px, lowered, raised
 from runtime.scene import Camera, Scene
@@ -41,6 +41,8 @@ from runtime.state_set import StateSet, scale_ratio, tangent_of_row
 
 SHARE_OF_DISC = 0.9
 """Of the radius of a lens's disc: beyond it markings are cut off."""
+ROWS_BEYOND = 2.0
+"""Rows beyond their ends within which the lines of markings are followed: so rows in which one may end are seen as a whole."""
 ROUNDED_TERMS = 16.0
 """Factor on the terms of a column's margin: what `LEAST_DEPTH` lets a rounding grow to, and more."""
 
@@ -137,7 +139,7 @@ class SensorBorders:
         assert optics is not None
         assert unknowns is not None
         stretch = optics.between(first, last + 1, row)
-        w, rest, known = unknowns.sheared_at(view, optics, *stretch.middle, stretch.reach)
+        w, rest, known = unknowns.sheared_at(view, Moves.at(view, optics, *stretch.middle, stretch.reach))
         low, high = self._quotients(optics, stretch)
         known &= stretch.known & view.rises_along(optics, stretch)
         return *_bounds_where(known, first > last, low - rest, high + rest), w
@@ -300,21 +302,21 @@ def _ends_behind_lens(
     rows = np.where(np.isfinite(rows), np.clip(rows, top, bottom), np.nan)
     rays = _rays_of_ends(camera, sets, view, offset, (rows, rows), margin_px)
     (low, high), known = shown_rows(optics, view.turns, rays.s, rays.t)
-    curves = Curves.of(optics, lines, rays.t[0][2], rays.t[1][1], margin_px / camera.focal_u_px)
+    beyond = ROWS_BEYOND / camera.focal_v_px
+    curves = Curves.of(optics, lines, rays.t[0][2] - beyond, rays.t[1][1] + beyond, margin_px / camera.focal_u_px)
     beside_px = optics.beside_px(np.maximum(np.abs(low), np.abs(high)), camera.focal_v_px)
     low, high = camera.v0 + camera.focal_v_px * low - beside_px, camera.v0 + camera.focal_v_px * high + beside_px
     terms = abs(camera.v0) + np.abs(low) + np.abs(high)
     low, high = below(lowered(low, terms)), above(raised(high, terms))
     known &= curves.monotone
-    outer, rays_at = (scene.runway.x_m.argmin(), scene.runway.x_m.argmax()), [(side[0] + side[1]) / 2 for side in (rays.s, rays.t)]
+    outer, usable = (scene.runway.x_m.argmin(), scene.runway.x_m.argmax()), np.isfinite(rays.s[0]) & np.isfinite(rays.t[0])
+    rays_at = [(np.where(usable, low, 0.0) + np.where(usable, high, 0.0)) / 2 for low, high in (rays.s, rays.t)]
     s, t = (np.stack([side[place, marking] for marking in outer for place in (3, 0)]) for side in rays_at)
-    usable = np.isfinite(s) & np.isfinite(t)
-    points = np.where(usable, s, 0.0), np.where(usable, t, 0.0)
     return (
         (np.where(known[0], low[0], -np.inf), np.where(known[1] & inside[1], high[1], np.inf)),
         (np.where(known[2] & inside[2], low[2], -np.inf), np.where(known[3], high[3], np.inf)),
         curves,
-        points,
+        (s, t),
     )
 
 

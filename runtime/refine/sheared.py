@@ -15,6 +15,7 @@ from runtime.refine.crossings import at_borders
 from runtime.refine.interval import Bits, Floats, Interval, intersected, relaxed_intersection
 from runtime.refine.lateral import scale_and_x
 from runtime.refine.sensor_borders import SensorBorders
+from runtime.refine.sensor_end_pixels import sheared_at_ends
 from runtime.refine.sight import Sight
 from runtime.rounding import ROUNDING_SHARE, lowered, raised
 from runtime.state_set import StateSet
@@ -35,22 +36,29 @@ def contract_by_sheared_offsets(sets: StateSet, sight: Sight) -> StateSet:
     borders = sight.borders
     assert isinstance(borders, SensorBorders)
     assert borders.unknowns is not None
-    seen, largest = _seen(borders, sight), borders.unknowns.sheared_px
-    scaled, shifted = borders.unknowns.scaled, borders.unknowns.shifted_px
+    seen, ends = _seen(borders, sight), sheared_at_ends(borders, sight)
+    known = borders.unknowns.known
+    largest, scaled, shifted = (
+        np.where(known, side, 0.0) for side in (borders.unknowns.sheared_px, borders.unknowns.scaled, borders.unknowns.shifted_px)
+    )
     scale = lowered(sets.scale[:, 0] * (1 - scaled), sets.scale[:, 0]), raised(sets.scale[:, 1] * (1 + scaled), sets.scale[:, 1])
     shift = shifted / np.where(scale[0] > 0, scale[0], np.nan)
     shift = np.where(np.isfinite(shift), shift, np.inf) * (1 + ROUNDING_SHARE)
     x = sets.x[:, 0] - shift, sets.x[:, 1] + shift
-    hull, count = _Hull.none(len(sets)), _pieces(seen, largest)
+    at_ends = [] if ends is None or not (sight.missed.left == 0).any() else [ends]
+    hull, count = _Hull.none(len(sets)), _pieces([*seen, *at_ends], largest)
     for number in range(count):
         least, most = largest * (2 * number / count - 1), largest * (2 * (number + 1) / count - 1)
-        hull = hull.joined(*_by_piece(sight, [_unsheared(part, least, most) for part in seen], scale, x))
-    refuted = ~hull.some | (sight.missed.left < 0)
+        parts, whole = ([_unsheared(part, least, most) for part in side] for side in (seen, at_ends))
+        hull = hull.joined(*_by_piece(sight, parts, whole, scale, x))
+    refuted = (known & ~hull.some) | (sight.missed.left < 0)
     low, high = (np.where(hull.some, side, 1.0) for side in hull.scale)
-    low, high = lowered(low / (1 + scaled), low), raised(high / np.where(scaled < 1, 1 - scaled, np.nan), high)
+    low, high = lowered(low / (1 + scaled), low), raised(high / (1 - scaled), high)
     x_low, x_high = (np.where(hull.some, side, 0.0) for side in hull.x)
     x_low, x_high = lowered(x_low - shift, np.abs(x_low) + shift), raised(x_high + shift, np.abs(x_high) + shift)
-    high = np.where(np.isfinite(high), high, np.inf)
+    low, high, x_low, x_high = (
+        np.where(known, side, bound) for side, bound in zip((low, high, x_low, x_high), (0.0, np.inf, -np.inf, np.inf), strict=True)
+    )
     return sets.contracted(scale=(low, high), x=(x_low, x_high)).emptied(refuted)
 
 
@@ -87,14 +95,16 @@ def _unsheared(seen: Sheared, least: Floats, most: Floats) -> Interval:
     return low + np.minimum(one, other) - margin, high + np.maximum(one, other) + margin
 
 
-def _by_piece(sight: Sight, parts: list[Interval], scale: Interval, x: Interval) -> tuple[Interval, Interval, Bits]:
-    """scale'', x'' and True for the sets that this piece does not refute."""
+def _by_piece(sight: Sight, parts: list[Interval], whole: list[Interval], scale: Interval, x: Interval) -> tuple[Interval, Interval, Bits]:
+    """scale'', x'' and True for the sets that this piece does not refute; `whole`: bounds which no missed pixel spoils."""
     missed = sight.missed
     if missed.budget == 0:
         ((low, high),) = parts
         low, high = np.maximum.reduce(low, axis=1), np.minimum.reduce(high, axis=1)
     else:
         low, high = relaxed_intersection(*intersected(*parts), np.maximum(missed.left, 0), missed.budget)
+    for least, most in whole:
+        low, high = intersected((low, high), (np.maximum.reduce(least, axis=1), np.minimum.reduce(most, axis=1)))
     refuted = np.logical_or.reduce(low > high, axis=0)
     offset = np.where(refuted, 0.0, low), np.where(refuted, 0.0, high)
     scale, seen_x = scale_and_x(sight.scene.runway.x_m, offset, scale, x)

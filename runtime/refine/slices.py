@@ -124,11 +124,13 @@ def _common(first: Floats, second: Floats) -> Floats:
 
 def _hulls(parts: StateSet, place: NDArray[np.int64], count: int, tangent: Floats) -> StateSet:
     """`count` sets: the hull of the parts at each place, wholly inverted where all are empty. Parts of one place share its tangent."""
-    left = ~parts.empty
+    left = np.flatnonzero(~parts.empty)
     low, high = np.full((count, len(INTERVALS)), np.inf), np.full((count, len(INTERVALS)), -np.inf)
-    below, above = _bounds(parts[left])
-    np.minimum.at(low, place[left], below)
-    np.maximum.at(high, place[left], above)
+    if len(left) > 0:
+        left = left[np.argsort(place[left], kind="stable")]
+        below, above = _bounds(parts[left])
+        places, first = np.unique(place[left], return_index=True)
+        low[places], high[places] = np.minimum.reduceat(below, first, axis=0), np.maximum.reduceat(above, first, axis=0)
     return _of_bounds(low, high, tangent)
 
 

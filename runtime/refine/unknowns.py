@@ -28,6 +28,7 @@ is that of both together: a pitch that is p less adds q (cos(c) - sin(c) t).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -62,27 +63,31 @@ class Moves:
     """dS/dD_x, dS/dD_y = dT/dD_x and dT/dD_y of the lens."""
     shown: tuple[Around, Around]
     """N."""
-    reach: tuple[Floats, Floats]
-    """How far from the points others of their stretches lie, along S and T."""
+    reach: Floats
+    """How far from that of the points the ideal rows t of others of their stretches lie."""
     known: Bits
 
     @staticmethod
-    def at(view: View, optics: Optics, s: Floats, t: Floats, reach: Floats) -> Moves:
-        """Of points whose rays lie, by the parameters in the middle, within `reach` of (s, t), along a border of the sensor."""
+    def at(view: View, optics: Optics, s: Floats, t: Floats, reach: Floats, down: Floats | None = None) -> Moves:
+        """Of points whose rays lie, by the parameters in the middle, within `reach` of (s, t), and along T within `down`.
+
+        Without `down` the points lie along a border of the sensor.
+        """
         zoom, right, below = optics.swings
         away = reach + optics.moved(s, t, reach)
-        across, mixed, down, off = optics.derivatives(s, t, away)
-        across, mixed, down = (Around(side, off) for side in (across, mixed, down))
-        share, known = Around(np.ones(1), np.zeros(1)).over(across * down - mixed * mixed)
-        inverse = down * share, Around(np.zeros(1), np.zeros(1)) - mixed * share, across * share
+        *jacobian, off = optics.derivatives(s, t, away)
+        across, mixed, along = (Around(side, off) for side in jacobian)
+        share, known = Around(np.ones(1), np.zeros(1)).over(across * along - mixed * mixed)
+        inverse = along * share, Around(np.zeros(1), np.zeros(1)) - mixed * share, across * share
         shown_u, shown_v = optics.lens.distorted(s, t)
         beside = reach * optics.lens.largest_scale
         step_u, step_v = zoom * (np.abs(shown_u) + beside) + right, zoom * (np.abs(shown_v) + beside) + below
         size = [np.abs(each.middle) + each.off for each in inverse]
-        reach_t = np.minimum((np.abs(mixed.middle) + off) / np.where(down.middle > off, down.middle - off, np.nan), 1.0) * reach
-        reach_t = np.where(np.isfinite(reach_t), reach_t, reach)
+        if down is None:
+            slope = (np.abs(mixed.middle) + off) / np.where(along.middle > off, along.middle - off, np.nan)
+            down = np.where(slope < 1, slope, 1.0) * reach
         ray_s = Around(s, reach + size[0] * step_u + size[1] * step_v)
-        ray_t = Around(t, reach_t + size[1] * step_u + size[2] * step_v)
+        ray_t = Around(t, down + size[1] * step_u + size[2] * step_v)
         cos_a, sin_a, cos_b, sin_b = _rotation(view)
         aside, y = cos_a * ray_s + sin_a * ray_t, cos_a * ray_t - sin_a * ray_s
         x, z = cos_b * aside - sin_b, sin_b * aside + cos_b
@@ -96,8 +101,8 @@ class Moves:
         by_zoom = by_u * shown[0] + by_v * shown[1] - tangent
         known = known & ahead & optics.within(s, t, away)
         rows, offs = (by_a, by_b, by_zoom, by_u, by_v), optics.off(view.turns)
-        along = (np.abs(by_s.middle) + by_s.off) * reach + (np.abs(by_t.middle) + by_t.off) * reach_t
-        return Moves(x, z, tangent, aside, y, rows, offs, inverse, shown, (reach, along), known)
+        reach_t = (np.abs(by_s.middle) + by_s.off) * reach + (np.abs(by_t.middle) + by_t.off) * down
+        return Moves(x, z, tangent, aside, y, rows, offs, inverse, shown, reach_t, known)
 
 
 def _rotation(view: View) -> tuple[Around, Around, Around, Around]:
@@ -149,9 +154,13 @@ class Common:
 
     @property
     def growth(self) -> Floats:
-        """rho* at most; infinite where it is not known."""
-        least = 1 - self.mu - self.nu * np.abs(self.w)
-        return np.where(least > LARGEST_CHANGE, 1 / np.where(least > LARGEST_CHANGE, least, 1.0), np.inf)
+        """rho* at most, where it is known."""
+        return 1 / np.where(self.known, 1 - self.mu - self.nu * np.abs(self.w), 1.0)
+
+    @property
+    def known(self) -> Bits:
+        """False where 1/w may change too much."""
+        return 1 - self.mu - self.nu * np.abs(self.w) > LARGEST_CHANGE
 
 
 @dataclass(frozen=True)
@@ -163,8 +172,6 @@ class Derivatives:
     w: Floats
     q: Floats
     eta: Floats
-    growth: Floats
-    """w at most, over w in the middle."""
     reach: Floats
     """How far w may be from that at the point along its stretch."""
     known: Bits
@@ -197,13 +204,18 @@ class Derivatives:
         m_a = (cos_b * moves.down + q * (cos_c * moves.aside - leaning * moves.down)) * per
         m_b = Around(-np.ones(1), np.zeros(1)) - sin_c * q * xi
         m_s = (cos_b * cos_a - q * (leaning * cos_a - cos_c * sin_a)) * per
-        m_t = (cos_b * sin_a - q * (cos_c * cos_a + leaning * sin_a)) * per
+        beside = (cos_b - q * leaning) * sin_a * per  # m_t but for the pitch's part
+        m_t = beside - q * cos_c * cos_a * per
         m_u, m_v = m_s * moves.inverse[0] + m_t * moves.inverse[1], m_s * moves.inverse[1] + m_t * moves.inverse[2]
+        m_zoom = m_u * moves.shown[0] + m_v * moves.shown[1]
+        if optics.lens.model is None:
+            m_zoom = (sin_b + q * sin_c * cos_b) * per
         if optics.tilt > 0:
-            m_v = m_v + q * (cos_c - sin_c * moves.t)
-        m = m_a, m_b, m_u * moves.shown[0] + m_v * moves.shown[1], m_u, m_v
-        reach = w * w * growth * largest * moves.reach[1]
-        return Derivatives(tuple(w * each.middle for each in m), m, w, q.middle, eta, growth, reach, known)
+            cancelled = q * cos_c * (Around(np.ones(1), np.zeros(1)) - cos_a * per * moves.inverse[2])
+            m_v = m_s * moves.inverse[1] + beside * moves.inverse[2] + cancelled - q * sin_c * moves.t
+        m = m_a, m_b, m_zoom, m_u, m_v
+        reach = w * w * growth * largest * moves.reach
+        return Derivatives(tuple(w * each.middle for each in m), m, w, q.middle, eta, reach, known)
 
 
 @dataclass(frozen=True)
@@ -238,9 +250,22 @@ class Unknowns:
                 part.append(np.where(np.isfinite(number), number, 0.0))
         return Unknowns(tuple(c), tuple(k), tuple(d), common, moves.off, view.largest_focal)
 
+    def _sum(self, parts: tuple[Floats, ...]) -> Floats:
+        return sum((np.abs(part) * off for part, off in zip(parts, self.off, strict=True)), np.zeros(1)) * ROUNDED_SWAY
+
+    @cached_property
+    def _growth(self) -> Floats:
+        """rho* at most, times what the q that is seen may be off: as q = q0 + C/(F s) + kappa (w - w*)/(F s) + G q of the q0 seen."""
+        least = 1 - self.common.growth * self._sum(self.d)
+        return self.common.growth / np.where(least > LARGEST_CHANGE, least, 1.0) * ROUNDED_SWAY
+
+    @property
+    def known(self) -> Bits:
+        """False where the parameters may move so much that nothing can be said, (sets,)."""
+        return self.common.known & (self.common.growth * self._sum(self.d) < LARGEST_CHANGE / 2)
+
     def _total(self, parts: tuple[Floats, ...]) -> Floats:
-        total = sum((np.abs(part) * off for part, off in zip(parts, self.off, strict=True)), np.zeros(1))
-        return total * ROUNDED_SWAY * self.common.growth
+        return self._sum(parts) * self._growth
 
     @property
     def scaled(self) -> Floats:
@@ -257,18 +282,17 @@ class Unknowns:
         """Largest |kappa|, (sets,)."""
         return self._total(self.k) * self.focal
 
-    def sheared_at(self, view: View, optics: Optics, s: Floats, t: Floats, reach: Floats) -> tuple[Floats, Floats, Bits]:
-        """w - w* and the largest size of the rest, px, at points of stretches (`Moves.at`), and where they are known."""
-        at = Derivatives.of(view, optics, Moves.at(view, optics, s, t, reach), self.common)
-        sheared, rest, swayed = at.w - self.common.w, np.zeros(1), np.zeros(1)
-        for m, off in zip(at.m, self.off, strict=True):
-            swayed = swayed + off * at.w * at.growth * (np.abs(m.middle) + m.off)
+    def sheared_at(self, view: View, moves: Moves) -> tuple[Floats, Floats, Bits]:
+        """w - w* and the largest size of the rest, px, at points, and where they are known."""
+        assert view.optics is not None
+        at = Derivatives.of(view, view.optics, moves, self.common)
+        sheared, rest = at.w - self.common.w, np.zeros(1)
         for by, m, c, k, d, off in zip(at.by, at.m, self.c, self.k, self.d, self.off, strict=True):
             left = np.abs(by - c - k * sheared - d * at.q)
             changed = at.w * (at.eta * (np.abs(m.middle) + m.off) + m.off)
-            beside = (np.abs(m.middle) + m.off + np.abs(k)) * at.reach + np.abs(d) * swayed
+            beside = (np.abs(m.middle) + m.off + np.abs(k)) * at.reach
             terms = np.abs(by) + np.abs(c) + np.abs(k) * (np.abs(at.w) + np.abs(self.common.w)) + np.abs(d * at.q)
             rest = rest + off * (left + changed + beside + ROUNDING_SHARE * terms)
-        rest = rest * self.focal * ROUNDED_SWAY * self.common.growth
-        known = at.known & np.isfinite(rest)
-        return np.where(known, sheared, 0.0), np.where(known, rest, np.inf), known
+        rest = rest * self.focal * self._growth
+        known = at.known & self.known & np.isfinite(rest)
+        return np.where(known, sheared, 0.0), np.where(known, rest, 0.0), known

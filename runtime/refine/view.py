@@ -12,7 +12,7 @@ import numpy as np
 
 from runtime.attitude import Turns
 from runtime.refine.interval import Bits, Floats, Interval
-from runtime.refine.optics import Optics, Stretch
+from runtime.refine.optics import Optics, Patch, Stretch
 from runtime.rounding import ROUNDING_SHARE, lowered, raised
 from runtime.scene import Camera
 from runtime.state_set import StateSet
@@ -112,7 +112,7 @@ class View:
         # concave in c up to straight down, or else its ends are not enough: a hair's breadth is what the middle can lie lower
         return least - (1 + np.abs(tangent_v)) * (turns.off + self.bulge + ROUNDING_SHARE) > 0
 
-    def rises_along(self, optics: Optics, stretch: Stretch) -> Bits:
+    def rises_along(self, optics: Optics, stretch: Stretch | Patch) -> Bits:
         """True where an offset grows along a stretch of a border behind a lens in all states, (markings, rows, sets).
 
         A step to the right there is (J_yy, -J_xy) over the determinant of the lens's Jacobian in rays, and an offset grows along (ds, dt)

@@ -1,6 +1,6 @@
 """Counts how often a certificate over time holds, and how soon a fault is found: random flights whose truth is known exactly.
 
-    python scripts/flights [MODEL.onnx ...] [--flights N] [--scenes N] [--seed N] [-o FILE.json]
+    python scripts/flights [MODEL.onnx ...] [--flights N] [--scenes N] [--no-faults] [--seed N] [-o FILE.json]
 
 Sound flights (`flights.sound`) keep all assumptions: a box without the state, at a frame or between two, INCONSISTENT, an exception and
 a frame without end are findings, with which the exit code is 1. On faulty ones (`flights.faulty`) one assumption is broken. Sound ones are
@@ -100,12 +100,12 @@ def limited_memory() -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_DATA, before)
 
 
-def tasks_of(version: str, seed: int, models: list[Path], flights: int, scenes: int) -> list[Task]:
+def tasks_of(version: str, seed: int, models: list[Path], flights: int, scenes: int, faults: bool = True) -> list[Task]:
     """All that a campaign flies, scenes and models in turn, so that one that is stopped has some of each. Raises `ModelError`."""
     shares: dict[float, list[Task]] = {}
     for path in models:
         model = f"{path.stem} {estimator_of(str(path)).sha256[:16]}"
-        for kind in (SOUND, *FAULTS):
+        for kind in (SOUND, *(FAULTS if faults else ())):
             count = flights if kind == SOUND else -(-flights // FAULTY_SHARE)
             for number in range(count):
                 shares.setdefault(number / count, []).append(Task(version, seed, kind, model, str(path), number))
@@ -129,6 +129,7 @@ def main(
     models: Annotated[list[Path] | None, typer.Argument(help="Models that export-model wrote; by default the paper's.")] = None,
     flights: Annotated[int, typer.Option(min=1, help="Sound flights of each model; a tenth as many with each fault.")] = 1000,
     scenes: Annotated[int, typer.Option(min=0, help="Scenes drawn at random, some short flights over each.")] = 100,
+    faults: Annotated[bool, typer.Option(help="Flights with each fault: as many frames again as the sound ones.")] = True,
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 2,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed of the flights; by default drawn anew.")] = None,
     output: Annotated[Path, typer.Option("-o", "--output", help="File of the counts.")] = Path("out/flights.json"),
@@ -139,10 +140,10 @@ def main(
         output.parent.mkdir(parents=True, exist_ok=True)
         journal_path, version = output.with_suffix(".flights.jsonl"), version_of_code()
         if seed is None:
-            stopped = seed_of_stopped(journal_path, version, len(tasks_of(version, 0, models or [PAPER], flights, scenes)))
+            stopped = seed_of_stopped(journal_path, version, len(tasks_of(version, 0, models or [PAPER], flights, scenes, faults)))
             seed = secrets.randbelow(2**32) if stopped is None else stopped
         print(f"seed {seed}", file=sys.stderr)
-        tasks = tasks_of(version, seed, models or [PAPER], flights, scenes)
+        tasks = tasks_of(version, seed, models or [PAPER], flights, scenes, faults)
         journal = ResultJournal(journal_path, (task.key for task in tasks), Outcomes.read, Outcomes.tables)
         missing = [task for task in tasks if task.key not in journal.done]
         try:
