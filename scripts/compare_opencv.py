@@ -3,7 +3,8 @@
     python scripts/compare_opencv.py [--model MODEL.onnx] [--frames 200] [--clutter 0 --clutter 0.02 --clutter 0.05] [--missed-budget 0]
 
 The model's scene has two markings with common ends; the paper's, an airport's, a long final (models/approach.toml). The baseline is told
-all that we know: the exact camera, no roll or yaw, x if it is fixed, the markings, and the domain of states.
+all that we know: the exact camera, no roll or yaw, x if it is fixed, the markings, and the domain of states. Frames of a camera with a
+lens are undistorted for it first.
 
 1. The frame is cropped to what the runway can reach from the domain. Connected components of lit pixels smaller than a marking can be are
    removed: a marking is one component, clutter is mostly single pixels.
@@ -28,6 +29,7 @@ median over frames of the processor time of one thread, and each method's own wo
 
 from __future__ import annotations
 
+import functools
 import itertools
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -357,6 +359,22 @@ class Answer:
         return float(np.linalg.norm(self.apart))
 
 
+@functools.cache
+def undistortion(scene: Scene, ideal: Scene) -> Callable[[Frame], Frame]:
+    """What users do with frames of a lens first: OpenCV's undistortion, onto the ideal frame, each pixel from the one that it lies in."""
+    camera, to = scene.camera, ideal.camera
+    if camera.distortion is None or camera.pinhole:
+        return lambda frame: frame
+    matrices = [
+        np.array([[each.focal_u_px, 0, each.u0 - 0.5], [0, each.focal_v_px, each.v0 - 0.5], [0, 0, 1]])  # OpenCV counts from centres
+        for each in (camera, to)
+    ]
+    coefficients, size = np.array(camera.distortion.coefficients), (to.width, to.height)
+    of = cv2.fisheye.initUndistortRectifyMap if camera.distortion.model == "fisheye" else cv2.initUndistortRectifyMap
+    maps = of(matrices[0], coefficients, np.eye(3), matrices[1], size, cv2.CV_32FC1)
+    return lambda frame: np.asarray(cv2.remap(frame, maps[0], maps[1], cv2.INTER_NEAREST), dtype=np.uint8)
+
+
 def has_network(estimator: Estimator) -> bool:
     """True unless the model's NN_e says the domain's centre of a dark frame, as the one does that stands for none."""
     dark = np.zeros(estimator.scene.camera.shape, dtype=np.uint8)
@@ -366,7 +384,10 @@ def has_network(estimator: Estimator) -> bool:
 def answers_of(
     estimator: Estimator, baseline: Baseline, truth: Floats, frame: Frame, clutter: float, network: bool = True
 ) -> Iterator[Answer]:
-    """Every method on one frame: ours first, NN_e alone if there is a `network`; then each detector with each solver."""
+    """Every method on one frame: ours first, NN_e alone if there is a `network`; then each detector with each solver,
+    behind a lens on the undistorted frame.
+    """
+    straight = undistortion(estimator.scene, estimator.ideal)
     if network:
         unrefined, milliseconds = timed(lambda: estimator.estimate(frame, refine=False))
         yield Answer(clutter, truth, "ours: NN_e alone", unrefined.network_state, milliseconds)
@@ -375,7 +396,7 @@ def answers_of(
     yield Answer(clutter, truth, "ours: centre of the box", centre, milliseconds)
     yield Answer(clutter, truth, OURS, estimate.state, milliseconds)
     for detector, solver in itertools.product(DETECTORS, SOLVERS):
-        state, milliseconds = timed(lambda detector=detector, solver=solver: baseline.estimate(frame, detector, solver))
+        state, milliseconds = timed(lambda detector=detector, solver=solver: baseline.estimate(straight(frame), detector, solver))
         yield Answer(clutter, truth, f"{detector}, {solver}", state, milliseconds)
 
 
@@ -455,9 +476,7 @@ def main(
     errors = terminal.console(stderr=True)
     try:
         estimator = Estimator.load(model, missed_budget=missed_budget)
-        if not estimator.scene.camera.pinhole:
-            raise ValueError(f"{model}: its camera has a lens, which the detectors do not know; give a model of a pinhole")
-        baseline = Baseline(estimator.scene)
+        baseline = Baseline(estimator.ideal)
     except (ModelError, ValueError) as error:
         fail(error)
     answers: list[Answer] = []

@@ -20,7 +20,8 @@ from typer.testing import CliRunner
 from runtime import Estimator, Scene
 from runtime.camera import ground_scale, project, row_of_point
 from runtime.image import runway_image
-from runtime.scene import Axis, Marking, Runway
+from runtime.scene import Axis, Camera, Distortion, Marking, Runway
+from runtime.sensor import Sensor
 
 UNKNOWNS = [0, 2, 3]
 Floats = NDArray[np.float64]
@@ -54,6 +55,21 @@ def test_the_frames_show_the_same_states_at_every_density_and_more_clutter_adds_
         assert (clean <= some).all()
         assert (some <= more).all()
         assert abs((some > clean).mean() - 0.02) < 0.002
+
+
+@pytest.mark.parametrize("lens", [("radial-tangential", (-0.28, 0.07, 0.001, -0.001)), ("fisheye", (0.01, 0.02, -0.01, 0.0))])
+def test_behind_a_lens_the_baseline_is_given_undistorted_frames(lens: tuple[str, tuple[float, ...]], paper_scene: Scene) -> None:
+    """A frame of lit markings becomes the ideal frame's, up to a pixel beside them; a pinhole's stays as it is."""
+    camera = Camera(640, 480, focal_px=(540.0, 525.0), principal_point=(300.0, 251.5), distortion=Distortion(*lens))
+    sensor = Sensor.of(dataclasses.replace(paper_scene, camera=camera))
+    for state in sensor.scene.domain.uniform(np.random.default_rng(3), 5):
+        straight = compare_opencv.undistortion(sensor.scene, sensor.ideal)(runway_image(sensor.scene, state))
+        ideal = runway_image(sensor.ideal, state)
+        assert straight.shape == ideal.shape
+        assert not (straight & ~cv2.dilate(ideal, np.ones((3, 3), np.uint8))).any()
+        assert not (ideal & ~cv2.dilate(straight, np.ones((5, 5), np.uint8))).any()
+    frame = runway_image(paper_scene, paper_scene.domain.lower)
+    assert compare_opencv.undistortion(paper_scene, paper_scene)(frame) is frame
 
 
 # --- codac ---
