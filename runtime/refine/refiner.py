@@ -70,9 +70,8 @@ FACES = 6
 NONE_MISSED = Search(first=4, theta=4, z=2, scale=1, pieces=2, rounds=8, gain=0.02)
 SOME_MISSED = Search(first=4, theta=3, z=2, scale=2, pieces=4, rounds=20, gain=0.02)
 """Missed pixels are counted where windows are a pixel or two wide (`missed`): then smaller pieces pay, cut along the scale too."""
-NARROWED = Search(first=4, theta=3, z=2, scale=2, pieces=4, rounds=20, gain=0.01, patience=2)
-"""Pixels may be missed, and the entries were cut to a prior: they are few, so that there is time for small gains, and for a round without
-one, after which the pieces that carry the faces are small enough for the next one to tell more."""
+NARROWED = Search(first=4, theta=3, z=2, scale=2, pieces=4, rounds=20, gain=0.002)
+"""Pixels may be missed, and the entries were cut to a prior: they are few, so that there is time for small gains."""
 TURNED = Search(first=2, theta=2, z=1, scale=1, pieces=16, rounds=80, gain=0.002, roll=2, yaw=2, patience=3)
 """Roll and yaw are known up to a plus-minus alone: half of it then tells more than half of a slice, and many pieces carry one face."""
 LEAST_SWAY_PX = 0.25
