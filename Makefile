@@ -75,6 +75,7 @@ evidence: out/paper.onnx out/approach.onnx out/drone.onnx test-lowest
 	$(BIN)/python scripts/coverage out/approach.onnx --frames 2400 -o out/coverage_approach.json
 	$(BIN)/python scripts/coverage out/drone.onnx --frames 2400 -o out/coverage_drone.json
 	$(BIN)/python scripts/random_scenes -o out/random_scenes.json
+	$(BIN)/python scripts/cameras --cameras 200 --frames 10000 -o out/cameras.json
 	$(BIN)/python scripts/flights $< -o out/flights.json
 
 clean:

@@ -125,7 +125,7 @@ def export_model(
         shift_px = check_calibration(ideal, tables.window)
         filter_part = filter_graph(ideal, tables)
     with watch.stage("NN_e"):
-        network, report = _state_network(ideal, filter_part, estimator, seed, progress)
+        network, report = _state_network(sensor, filter_part, estimator, seed, progress)
     with watch.stage("file"):
         graph = _joined(filter_part, network)
         bounds = paper_bounds(ideal, jobs, dask)
@@ -226,14 +226,15 @@ def filter_function(filter_part: onnx.GraphProto) -> Callable[[NDArray[np.uint8]
 
 
 def _state_network(
-    scene: Scene, filter_part: onnx.GraphProto, estimator: str | Path | None, seed: int, progress: Progress
+    sensor: Sensor, filter_part: onnx.GraphProto, estimator: str | Path | None, seed: int, progress: Progress
 ) -> tuple[onnx.GraphProto, TrainingReport | None]:
     """NN_e as a graph: none but a constant, the user's, or one trained on what NN_F lets through."""
+    scene = sensor.ideal
     if estimator == NO_ESTIMATOR:
         return constant_network(scene), None
     if estimator is not None:
         return user_network(scene, Path(estimator)), None
-    network, report = train_state_network(scene, filter_function(filter_part), seed, progress)
+    network, report = train_state_network(scene, filter_function(filter_part), seed, progress, sensor)
     return state_graph(network, OPSET).graph, report
 
 

@@ -85,7 +85,8 @@ class WindowNetwork(FilterNetwork):
     """NN_F of a bank of windows in torch, as it is defined.
 
     The first `places` groups that pass their gates are opened, and group 0 if they are fewer. An entry misses as many pixels as its group's
-    gate shows, or as its own windows do where the group is opened and that is more.
+    gate shows, or as its own windows do where the group is opened and that is more. Outside the smallest rectangle that holds S of all
+    cells, everything counts as dark.
     """
 
     def __init__(self, scene: Scene, banks: Sequence[CellWindows]) -> None:
@@ -94,7 +95,8 @@ class WindowNetwork(FilterNetwork):
 
     def forward(self, frame: Tensor, missed_budget: int, extra_budget: int) -> dict[str, Tensor]:  # noqa: ARG002 - O is S: none is extra
         """`frame`: uint8 (height, width) of {0, 1}. `extra_budget` has no effect."""
-        both = both_sides(dilated(self.scene, frame))
+        seen = self._of_some_cell()
+        both = both_sides(dilated(self.scene, frame * seen) * seen)
         gates = [dark_windows(bank.gate, both) for bank in self.banks]
         passing = torch.cat(gates) <= missed_budget
         places = min(windowed_bank(self.scene).places, len(passing))
@@ -108,6 +110,13 @@ class WindowNetwork(FilterNetwork):
         outputs, chosen = self._summed_up([part <= missed_budget for part in missed], missed)
         overflow = passing.sum() > places
         return outputs | {"filtered": frame * self._between(chosen).to(torch.uint8), "overflow": overflow}
+
+    def _of_some_cell(self) -> Tensor:
+        """1 in the smallest rectangle that holds S of all cells, uint8 (height, width)."""
+        covered = self._between(torch.ones(len(self.banks), dtype=torch.bool))
+        rows, columns = (covered.any(dim=axis).to(torch.uint8) for axis in (1, 0))
+        rows, columns = (side.cummax(dim=0).values * side.flip(0).cummax(dim=0).values.flip(0) for side in (rows, columns))
+        return rows[:, None] * columns
 
     def _between(self, chosen: Tensor) -> Tensor:
         """True, for each marking and row, from the first to the last column of the chosen cells' S, (height, width)."""

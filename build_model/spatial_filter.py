@@ -14,11 +14,13 @@ from build_model.partition import partition
 from build_model.pixel_mask import paint, widened, window_of
 from build_model.window import Bits, Window
 from runtime.camera import row_of_point
-from runtime.scene import Camera, Scene, SceneError
+from runtime.scene import Bank, Camera, Scene, SceneError
 from runtime.state_set import StateSet, contract, scale_range, tangent_of_row
 
 BELOW_HORIZON_PX = 1
 """Least distance of a reference row from the horizon, px: twice what a loaded model must keep (`runtime.model.limits`)."""
+FEW_BINS, FEW_CELLS = "bank.pitch_bins: too few", "domain.theta_rad: too few cells"
+"""What is wrong where a box of states is too wide in theta: in a bank of masks, and in one of windows."""
 SLICES = 32
 """Slices of theta a cell. Eight times as many take less than one pixel in 100 from S of the paper's cells."""
 
@@ -29,17 +31,18 @@ def sliced(lower: float, upper: float, bins: int) -> NDArray[np.float64]:
     return np.stack([edges[:-1], edges[1:]], axis=-1)
 
 
-def reference_row(camera: Camera, lower: NDArray[np.float64], upper: NDArray[np.float64], middle_z_m: float) -> float:
+def reference_row(camera: Camera, lower: NDArray[np.float64], upper: NDArray[np.float64], middle_z_m: float, few: str = FEW_BINS) -> float:
     """The row, rounded, where the box's middle state sees the middle of the runway, or the nearest one that bounds the scale well.
 
     It lies in the frame, where the scale says what a pixel sees, and `BELOW_HORIZON_PX` or more below the horizon of every theta of the
-    box, so that no ratio of scales has a small divisor; on a frame that shows some theta no ground, that takes it below the frame.
+    box, so that no ratio of scales has a small divisor; on a frame that shows some theta no ground, that takes it below the frame. Raises
+    `SceneError`, by `few` of what divides theta, where the box is too wide for that.
     """
     theta, _, y, z = (lower + upper) / 2
     row = float(row_of_point(camera, theta, y, z + middle_z_m))
     horizon = camera.v0 - camera.focal_v_px * np.tan(lower[0])
     if row <= horizon:
-        raise SceneError(f"bank.pitch_bins: too few for theta in [{lower[0]:.4g}, {upper[0]:.4g}]; give more, or narrower cells")
+        raise SceneError(f"{few} for theta in [{lower[0]:.4g}, {upper[0]:.4g}]; give more, or narrower cells")
     return max(float(np.clip(np.round(row), 0, camera.height)), float(np.ceil(horizon)) + BELOW_HORIZON_PX)
 
 
@@ -48,7 +51,9 @@ def slice_cell(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float
     camera = scene.camera
     theta = sliced(lower[0], upper[0], slices)
     rest = [np.broadcast_to([low, high], (slices, 2)) for low, high in zip(lower[1:], upper[1:], strict=True)]
-    tangent = np.full(slices, tangent_of_row(camera, reference_row(camera, lower, upper, scene.runway.ends_z_m.mean())))
+    few = FEW_BINS if isinstance(scene.bank, Bank) else FEW_CELLS
+    row = reference_row(camera, lower, upper, scene.runway.ends_z_m.mean(), few)
+    tangent = np.full(slices, tangent_of_row(camera, row))
     scale = np.stack(scale_range(camera, theta, rest[1], tangent), axis=-1)
     return contract(camera, StateSet(theta, rest[0], rest[1], rest[2], scale, tangent))
 

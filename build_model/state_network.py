@@ -28,8 +28,9 @@ from build_model.partition import partition
 from build_model.spatial_filter import spatial_window
 from build_model.window import Window
 from runtime.camera import project
-from runtime.image import image_of_ends
+from runtime.image import image_of_ends, runway_image
 from runtime.scene import STATE_NAMES, STATE_UNITS, Scene
+from runtime.sensor import Sensor
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -219,11 +220,14 @@ class FilteredFrames:
 
 @dataclass(frozen=True)
 class FrameSource:
-    """Draws frames of a scene: random states of the domain, missed pixels, clutter, then NN_F."""
+    """Draws frames of a scene: random states of the domain, missed pixels, clutter, then NN_F. Behind a lens, whose `sensor` is given, all
+    of this is of the sensor's own frame, which is then painted, as NN_F and NN_e will see it.
+    """
 
     scene: Scene
     window: Window
     filter_frames: Filter
+    sensor: Sensor | None = None
 
     def draw(
         self, count: int, rng: np.random.Generator, clutter: float | None = None, advance: Callable[[int], None] = lambda _done: None
@@ -238,17 +242,33 @@ class FrameSource:
 
     def _batch(self, count: int, rng: np.random.Generator, clutter: float | None) -> tuple[NDArray[np.float64], Frames]:
         states = self.scene.domain.uniform(rng, count)
-        ends = project(self.scene, states) - [self.window.left, self.window.top]
-        crops = image_of_ends(ends, self.window.shape)
+        crops = self._images(states)
         density = np.full(count, clutter)
         if clutter is None:
             miss_pixels(crops, rng.integers(1, LARGEST_MISSED + 1, count) * (rng.random(count) < 0.5), rng)
             density = self.scene.estimator.largest_clutter * np.square(rng.random(count)) * (rng.random(count) >= CLEAN_SHARE)
         crops |= rng.random(crops.shape, dtype=np.float32) < density[:, None, None]
-        frames = np.zeros((count, *self.scene.camera.shape), dtype=np.uint8)
-        frames[:, *self.window.slices] = crops
-        filtered = self.filter_frames(frames)[:, *self.window.slices]
+        filtered = self.filter_frames(self._ideal_frames(crops))[:, *self.window.slices]
         return states, np.packbits(filtered.reshape(count, -1), axis=1)
+
+    def _images(self, states: NDArray[np.float64]) -> Frames:
+        """The runway's images, (n, rows, columns): the window's pixels, or those of the sensor that show something of the ideal frame."""
+        if self.sensor is None or self.sensor.painting is None:
+            return image_of_ends(project(self.scene, states) - [self.window.left, self.window.top], self.window.shape)
+        return runway_image(self.sensor.scene, states)[:, *self.sensor.painting.window]
+
+    def _ideal_frames(self, crops: Frames) -> Frames:
+        """The ideal frames (n, height, width) of such parts."""
+        if self.sensor is None or self.sensor.painting is None:
+            frames = np.zeros((len(crops), *self.scene.camera.shape), dtype=np.uint8)
+            frames[:, *self.window.slices] = crops
+            return frames
+        sensor, own = self.sensor, np.zeros(self.sensor.scene.camera.shape, dtype=np.uint8)
+        frames = np.empty((len(crops), *self.scene.camera.shape), dtype=np.uint8)
+        for frame, crop in zip(frames, crops, strict=True):
+            own[self.sensor.painting.window] = crop
+            frame[:] = sensor.painted(own)
+        return frames
 
 
 def miss_pixels(frames: Frames, missed: NDArray[np.int64], rng: np.random.Generator) -> None:
@@ -261,16 +281,22 @@ def miss_pixels(frames: Frames, missed: NDArray[np.int64], rng: np.random.Genera
 
 
 def train_state_network(
-    scene: Scene, filter_frames: Filter, seed: int, progress: Progress = lambda _stage, _done, _total, _loss: None
+    scene: Scene,
+    filter_frames: Filter,
+    seed: int,
+    progress: Progress = lambda _stage, _done, _total, _loss: None,
+    sensor: Sensor | None = None,
 ) -> tuple[StateNetwork, TrainingReport]:
     """NN_e of the scene, trained as its [estimator] table says. The same arguments give the same weights on the same CPU features.
+
+    `sensor`: of a camera with a lens, whose ideal scene this is; NN_e is trained on its frames as they are painted.
 
     The caller's random state and settings of torch are left as they were.
     """
     training = scene.estimator
     with _reproducible(seed):
         network = StateNetwork(scene)
-        source = FrameSource(scene, network.window, filter_frames)
+        source = FrameSource(scene, network.window, filter_frames, sensor)
         of_training, of_validation, of_order = (np.random.default_rng(child) for child in np.random.SeedSequence(seed).spawn(3))
         total = training.training_frames
         frames = source.draw(total, of_training, advance=lambda done: progress("frames for NN_e", done, total, None))

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from build_model.enclosure import columns_at_borders, columns_that_may_be_lit
 from build_model.line_boxes import HALVING_ORDER, HALVINGS, MOST_WEAK, LineBoxes
 from build_model.pixel_mask import widened
-from build_model.spatial_filter import reference_row, slice_cell, sliced
+from build_model.spatial_filter import FEW_CELLS, reference_row, slice_cell, sliced
 from build_model.window import Bits
 from runtime.camera import row_of_point
 from runtime.model.limits import SCALE_STEP, SMALLEST_LEVER_M
@@ -224,7 +224,7 @@ def _columns_of_boxes(scene: Scene, lower: NDArray[np.float64], upper: NDArray[n
     for theta, z in itertools.product(sliced(lower[0], upper[0], theta_bins), sliced(lower[3], upper[3], z_bins)):
         low, high = lower.copy(), upper.copy()
         (low[0], high[0]), (low[3], high[3]) = theta, z
-        row = reference_row(camera, low, high, near_m)
+        row = reference_row(camera, low, high, near_m, FEW_CELLS)
         scale = np.array(scale_range(camera, theta, np.array([lower[2], upper[2]]), tangent_of_row(camera, row)))
         x_bins = _bins((upper[1] - lower[1]) * scale.mean(), steps["x"])
         below_horizon_px = row - (camera.v0 - camera.focal_v_px * math.tan(theta.mean()))

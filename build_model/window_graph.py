@@ -43,27 +43,23 @@ def _row_sums(g: GraphWriter, scene: Scene, tables: WindowTables, crop: str) -> 
     g.whole("flat", -1)
     if tolerance:
         crop = witnesses(g, crop, tolerance)
-    turned = g.node("Pad", "turned_padded", g.node("Transpose", "turned", _both_sides(g, tables, crop), perm=[1, 0]), "column_of_zeros")
-    counted = g.node("Cast", "turned_counted", turned, to=TensorProto.INT32)
+    turned = g.node("Transpose", "turned", _both_sides(g, tables, crop), perm=[1, 0])
+    counted = g.node("Pad", "turned_counted", g.node("Cast", "turned_lit", turned, to=TensorProto.INT32), "column_of_zeros")
     return g.node("Reshape", "sums", g.node("CumSum", "row_sums", counted, "along"), "flat")
 
 
 def _both_sides(g: GraphWriter, tables: WindowTables, pixels: str) -> str:
-    """J: the pixels with one below them, or below and beside."""
+    """J: the pixels with one below them, or below and beside. Of bools, since not every onnxruntime has Max and Min of bytes."""
     rows, columns = tables.window.shape
-    wide = g.node("Pad", "pixels_padded", pixels, g.whole("around", 0, 1, 1, 1))
-    beneath = [
-        g.node(
-            "Slice",
-            f"beneath_{shift}",
-            wide,
-            g.whole(f"beneath_{shift}_from", 1, shift),
-            g.whole(f"beneath_{shift}_to", rows + 1, shift + columns),
-            "rows_and_columns",
-        )
-        for shift in range(3)
-    ]
-    return g.node("Min", "both_sides", pixels, g.node("Max", "beneath", *beneath))
+    wide = g.node("Cast", "pixels_lit", g.node("Pad", "pixels_padded", pixels, g.whole("around", 0, 1, 1, 1)), to=TensorProto.BOOL)
+
+    def part(name: str, row: int, column: int) -> str:
+        first, stop = g.whole(f"{name}_from", row, column), g.whole(f"{name}_to", row + rows, column + columns)
+        return g.node("Slice", name, wide, first, stop, "rows_and_columns")
+
+    own, beneath = part("own", 0, 1), [part(f"beneath_{shift}", 1, shift) for shift in range(3)]
+    beside = g.node("Or", "beside", beneath[0], beneath[2])
+    return g.node("And", "both_sides", own, g.node("Or", "beneath", beside, beneath[1]))
 
 
 def _missed(g: GraphWriter, scene: Scene, tables: WindowTables, sums: str) -> str:

@@ -65,6 +65,13 @@ class Attitude:
             halves.append(float(raised(max(high - middle, middle - low), abs(low) + abs(high))) if high > low else 0.0)
         return Attitude(middles[0], middles[1], halves[0], halves[1])
 
+    def wider(self, roll_rad: float, yaw_rad: float) -> Attitude:
+        """The same readings with so much more of a plus-minus."""
+        if roll_rad == 0 and yaw_rad == 0:
+            return self
+        roll, yaw = self.roll_plus_minus_rad + roll_rad, self.yaw_plus_minus_rad + yaw_rad
+        return Attitude(self.roll_rad, self.yaw_rad, float(raised(roll, roll)), float(raised(yaw, yaw)))
+
     @property
     def roll(self) -> tuple[float, float]:
         """The least and the largest roll, rad."""
@@ -182,6 +189,12 @@ class Turns:
         (cos_b, sin_b0), off_b = _middle(b, np.abs(b[0]) + np.abs(b[1]))
         return Turns(cos_a, sin_a, cos_b, sin_b0, off_a, off_b)
 
+    @staticmethod
+    def level(count: int, off_a: float, off_b: float) -> Turns:
+        """Of `count` sets whose sensor is not turned, but for so much at most."""
+        one, nothing = np.ones(count), np.zeros(count)
+        return Turns(one, nothing, one, nothing, np.full(count, off_a), np.full(count, off_b))
+
     @property
     def off(self) -> Floats:
         """The largest angle between one of a set's rotations and the one in the middle."""
@@ -197,6 +210,14 @@ def seen_pitch(pitch: Floats, yaw: Floats) -> Floats:
     """Interval of the pitch c that the ideal frame shows where the camera's is in `pitch`; shapes as in `camera_pitch`."""
     cosine = _cosines(yaw)
     return _angles(_product(_tangents(pitch), (1 / cosine[1], 1 / cosine[0])))
+
+
+def rotation_at(theta: Floats, attitude: Attitude) -> tuple[Floats, Floats, Floats]:
+    """(a, b, c) of cameras that look down by `theta`, any shape, with the attitude's own roll and yaw. For drawing: no interval."""
+    tangent, psi = np.tan(theta), attitude.yaw_rad
+    c = np.arctan(tangent / math.cos(psi))
+    b = np.arctan(-np.cos(c) * math.tan(psi))
+    return np.arctan(np.sin(b) * np.tan(c)) - attitude.roll_rad, b, c
 
 
 def lead(seen_pitch: Floats, pitch: Floats, yaw: Floats) -> Floats:

@@ -11,6 +11,7 @@ is left of the entries within a box that is known to hold the state.
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -28,6 +29,7 @@ from runtime.model.entries import Entries
 from runtime.model.format import BOX_TENSORS, MASK_TENSORS, OVERFLOW, SPAN_TENSORS, ModelError
 from runtime.model.model_file import ModelFile, packaged_model, parse_model, read_model
 from runtime.model.session import check_interface, open_session, outputs_of, reason_of
+from runtime.on_sensor import refined
 from runtime.refine.refiner import Refiner
 from runtime.refine.regions import hulls, regions_of
 from runtime.refine.slices import covering, within
@@ -36,7 +38,7 @@ from runtime.refine.witnesses import witnesses
 from runtime.scene import STATE_NAMES, Scene, SceneError
 from runtime.sensor import Sensor
 from runtime.state_set import StateSet
-from runtime.turned import TurnedStart, hull_of, seen_box, started
+from runtime.turned import TurnedStart, hull_of, seen_box, seen_by_turned, started
 
 REFINED_BEYOND_PX = 2
 """How far beyond the spatial masks the refinement looks at pixels; those farther out it takes for lit."""
@@ -47,7 +49,7 @@ class Found:
     """What the model says of one frame: its outputs (models/README.md), `filtered` in the sensor's frame."""
 
     pixels: NDArray[np.uint8]
-    """The ideal frame: the sensor's own, or what was painted of it."""
+    """The sensor's frame, its own."""
     cell: int
     support: NDArray[np.int32]
     mismatch: NDArray[np.int32]
@@ -86,6 +88,7 @@ class Estimator:
         self.attitude = None if bounds is None else Attitude.between(bounds.roll_rad, bounds.yaw_rad)
         window = self._entries.window_and_beyond(REFINED_BEYOND_PX)
         self._refiner = Refiner(self.ideal, int(self._budgets["missed_budget"]), int(self._budgets["extra_budget"]), window)
+        self._sensor_refiner = Refiner(self.scene, self.missed_budget, -1)
         budgets = {"missed_budget": self.missed_budget, "extra_budget": self.extra_budget}
         self.assumed = tuple(assumptions(replace(self.scene, tolerance=replace(self.scene.tolerance, **budgets))))
         # The file's absolute path: whoever reads it again may do so after a change of folder.
@@ -111,6 +114,11 @@ class Estimator:
     def extra_budget(self) -> int:
         """e of Theorem B, or -1 where it is not used."""
         return int(self._budgets["extra_budget"])
+
+    @property
+    def beside_px(self) -> int:
+        """How far beside its place a pixel may fire: `line_px`, less the whole pixels of it that NN_F needs for the calibration."""
+        return max(self.scene.tolerance.line_px - math.ceil(self.metadata.get("calibration_shift_px", 0.0)), 0)
 
     @property
     def largest_missed_budget(self) -> int:
@@ -172,7 +180,7 @@ class Estimator:
         Theorem A alone is used. Raises `FrameError` for any other frame and ValueError for a proposal of another shape.
         """
         state = None if proposal is None else self._checked_proposal(proposal)
-        attitude = attitude or self.attitude
+        attitude = self.known_attitude(attitude)
         found = self.find(frame, attitude, prior)
         if prior is None:
             return self._alone(found, refine, state)
@@ -185,29 +193,28 @@ class Estimator:
         assumed = (*self.assumed_of(found), prior_assumption(prior.lower, prior.upper))
         return self.concluded(found, regions, assumed, otherwise, state, left)
 
+    def known_attitude(self, told: Attitude | None) -> Attitude | None:
+        """Roll and yaw of the camera: as told or by the scene, and what [calibration] has of a plus-minus besides; None if level."""
+        told, off = told or self.attitude, self.scene.calibration
+        return None if told is None else told.wider(off.roll_rad, off.yaw_rad)
+
     def find(self, frame: NDArray, attitude: Attitude | None = None, prior: Box | None = None) -> Found:
         """What the model says of a frame; of one of a rolled or yawed camera, at the pitches that a prior allows.
 
-        Raises `FrameError` as `estimate` does, and ValueError for an attitude with a plus-minus in [calibration], or with a
-        budget of missed pixels behind a lens.
+        `attitude`: as `known_attitude` has it. Raises `FrameError` as `estimate` does.
         """
         own, turned = self._checked_frame(frame), None
         if attitude is None:
-            pixels = self.sensor.painted(own)
-            outputs = self.run_unchecked(pixels)
+            outputs = self.run_unchecked(self.sensor.painted(own))
         else:
-            if not self.scene.calibration.exact:
-                raise ValueError("attitude: found a scene with a plus-minus in [calibration]; give that of roll and yaw with the attitude")
-            if self.sensor.map is not None and self.missed_budget > 0:
-                raise ValueError(f"attitude: found missed_budget {self.missed_budget} behind a lens; load the model with 0")
-            pixels, seen = own, self._seen(prior, attitude)
-            outputs, turned = started(self.sensor, self._entries, self._run_by_theorem_a, own, attitude, seen)
+            seen, window = self._seen(prior, attitude), self._refiner.window
+            outputs, turned = started(self.sensor, self._entries, self._run_by_theorem_a, own, attitude, seen, self.beside_px, window)
         overflow = bool(outputs.pop(OVERFLOW, False))
         cell, support, mismatch, passes, lower, upper, filtered, network_state = outputs.values()
         network = np.where(self.scene.domain.fixed, self.domain.lower, network_state)
-        if pixels is not own:
+        if self.sensor.map is not None and turned is None:
             filtered = own & self.sensor.seen_in(filtered.view(np.bool_))
-        return Found(pixels, int(cell), support, mismatch, passes, lower, upper, filtered, network, overflow, turned)
+        return Found(own, int(cell), support, mismatch, passes, lower, upper, filtered, network, overflow, turned)
 
     def _run_by_theorem_a(self, pixels: NDArray[np.uint8], met_by_one: int) -> dict[str, Any]:
         """`run_unchecked` of a painted frame, in which a missed pixel may spoil several; without Theorem B, which nobody vouches for."""
@@ -235,7 +242,12 @@ class Estimator:
         """
         cut = None if known is None else partial(within, self.ideal.camera, known=known)
         if found.turned is not None:
-            return found.turned.left(self._refiner, cut, refine)
+            return found.turned.left(self._sensor_refiner, cut, refine)
+        if self.sensor.optics:
+            entries = self._entries.sets(found.passes)
+            entries = entries if cut is None else cut(entries)
+            lit = witnesses(found.pixels.view(np.bool_), self.beside_px)
+            return refined(self._sensor_refiner, self.sensor.optics, lit, entries, cut is not None) if refine else entries
         frame, line_px = found.pixels.view(np.bool_), self.ideal.tolerance.line_px
         if refine and self._refiner.extra_budget >= 0 and line_px == 0:  # Theorem B's claims are made at tolerance 0 only
             return refined_by_cell(self._refiner, self._entries, found.passes, frame, cut)
@@ -322,9 +334,16 @@ class Estimator:
             return by_processes(partial(_loaded, self._arguments), self.scene.camera.width, pixels, processes)
         return by_threads(partial(self.estimate, refine=False), pixels, processes)
 
-    def spatial_mask(self, cell: int) -> NDArray[np.bool_]:
-        """S of a cell, (height, width): every pixel that one of its states can light, widened by the tolerance."""
-        return self.sensor.seen_in(self._entries.within(cell, np.ones(self.ideal.camera.shape, dtype=np.bool_)))
+    def spatial_mask(self, cell: int, attitude: Attitude | None = None) -> NDArray[np.bool_]:
+        """S of a cell, (height, width): every pixel that one of its states can light, widened by the tolerance.
+
+        For an attitude what a camera at its middle and at the middle of the cell's pitch shows of it, for drawing.
+        """
+        mask = self._entries.within(cell, np.ones(self.ideal.camera.shape, dtype=np.bool_))
+        if attitude is None:
+            return self.sensor.seen_in(mask)
+        lower, upper = self.scene.domain.cells()
+        return seen_by_turned(self.sensor, mask, attitude, float(lower[cell][0] + upper[cell][0]) / 2, self._refiner.window)
 
     def _reaches_boundary(self, found: Found, box: Box, left: StateSet | None) -> bool:
         """True if a box reaches a face of the domain; of a rolled or yawed camera, if what is left does, by the ideal frame's pitch."""

@@ -164,13 +164,28 @@ class Lens:
         |D''| <= 3/2 sup |f''| + 6 |p|: with g = f/r, D''[u, u] has the radial part f'' c^2 + g' s^2 and the other one 2 g' c s, for a unit
         vector u at an angle of cosine c; and g'(r), the mean of t f''(t r) over t from 0 to 1, is half of the largest |f''| up to there.
         """
-        bend = np.maximum.accumulate(self.bounds.bend)
         kept = max(int(np.searchsorted(self.bounds.edges, radius)), 1)
-        return float(((1.5 * bend + 6 * self._tangential_size) / self.stretches**3)[:kept].max() * (1 + ROUNDING_SHARE))
+        return float((self._bends / self.stretches**3)[:kept].max() * (1 + ROUNDING_SHARE))
+
+    @property
+    def _bends(self) -> Floats:
+        """Bound on |D''| up to the end of each slice, (slices,)."""
+        return 1.5 * np.maximum.accumulate(self.bounds.bend) + 6 * self._tangential_size
+
+    @cached_property
+    def largest_bend(self) -> float:
+        """Bound on |D''| on the disc. As D is a gradient, no entry of its Jacobian differs between two points by more per unit of way."""
+        return float(self._bends[-1] * (1 + ROUNDING_SHARE))
 
     def stretch_within(self, radius: float) -> float:
         """The least of `stretches` up to a radius."""
         return float(self.stretches[: max(int(np.searchsorted(self.bounds.edges, radius)), 1)].min())
+
+    @cached_property
+    def largest_scale(self) -> float:
+        """A bound above |D(x)|/|x| and the Jacobian's eigenvalues on the disc."""
+        largest = max(float(self.bounds.across[1].max()), float(self.bounds.along[1].max()))
+        return (largest + 6 * self._tangential_size * self.radius) * (1 + ROUNDING_SHARE)
 
     @cached_property
     def rounding(self) -> float:
@@ -234,6 +249,10 @@ class Lens:
         run = np.lib.stride_tricks.sliding_window_view(padded, 2 * reach + 1).min(axis=1)
         return run[np.minimum((radius / step).astype(np.int64), SLICES - 1)]
 
+    def stretches_around(self, radius: Floats, distance: float) -> Floats:
+        """A bound below the eigenvalues at all points of the disc within `distance` of one at `radius`."""
+        return self._stretch_within(np.minimum(radius, self.radius), np.full(1, distance))
+
     def _inverted(self, x: Floats, y: Floats) -> tuple[Floats, Floats]:
         """About the ray of the disc that is shown at (x, y): by the radial part's table, then Newton's steps within the disc."""
         edges = self.bounds.edges
@@ -243,7 +262,7 @@ class Lens:
         found_x, found_y = x * share, y * share
         for _ in range(NEWTON_STEPS):
             off_x, off_y = self.distorted(found_x, found_y)
-            a, b, d = self._jacobian(found_x, found_y)
+            a, b, d = self.jacobian(found_x, found_y)
             off_x, off_y = off_x - x, off_y - y
             determinant = a * d - b * b
             found_x, found_y = found_x - (d * off_x - b * off_y) / determinant, found_y - (a * off_y - b * off_x) / determinant
@@ -252,8 +271,8 @@ class Lens:
             found_x, found_y = found_x * back, found_y * back
         return found_x, found_y
 
-    def _jacobian(self, x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
-        """About dD_x/dx, dD_x/dy = dD_y/dx and dD_y/dy."""
+    def jacobian(self, x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
+        """dD_x/dx, dD_x/dy = dD_y/dx and dD_y/dy, of any shape, up to what float64 loses."""
         square = x * x + y * y
         across = self._scale(square)
         gap = (self._slope(square) - across) / np.where(square > 0, square, 1.0)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
@@ -142,6 +142,16 @@ def moved_each(camera: Camera, unions: Sequence[StateSet], by: Sequence[Displace
     left = ~after.empty
     after, borders = after[left], np.searchsorted(union[left], np.arange(len(unions) + 1))
     return [after[start:stop] for start, stop in itertools.pairwise(borders.tolist())]
+
+
+def tilted(camera: Camera, sets: StateSet, most_rad: float) -> StateSet:
+    """Sets, one of each, that hold all its states with the pitch changed by up to `most_rad`, at the same place; roll and yaw stay."""
+    step = Displacement(*(np.tile([sign * most_rad, 0.0, 0.0, 0.0], (len(sets), 1)) for sign in (-1, 1)))
+    theta = sets.theta + np.array([-most_rad, most_rad])
+    theta = np.stack([lowered(theta[:, 0], np.abs(theta[:, 0])), raised(theta[:, 1], np.abs(theta[:, 1]))], axis=-1)
+    sets = rereferenced(sets, tangents_below_horizon(camera, sets.tangent, theta[:, 0]))
+    moved = replace(sets, theta=theta, scale=_moved_scale(sets, theta, sets.y, step))
+    return contract_by_altitude(camera, moved)
 
 
 def with_pitches(sets: StateSet, by: Displacement, yaw_before: tuple[float, float], yaw_after: tuple[float, float]) -> Displacement:

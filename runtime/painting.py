@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.outline import Outline, Window
 from runtime.refine.interval import Floats, Interval
 from runtime.rounding import OUTWARD_PX, ROUNDING_SHARE
 from runtime.scene import Scene
@@ -57,12 +58,13 @@ class Painting:
         view = View.of(sensor)
         rows, columns = (side.ravel() for side in np.mgrid[view.window])
         parcels = [what_pixels_show(sensor, rows[at : at + PARCEL], columns[at : at + PARCEL]) for at in range(0, len(rows), PARCEL)]
-        most = max((part[0].shape[1] for part in parcels), default=1)
         none = sensor.ideal.height * sensor.ideal.width
+        tables = [part.table(none) for part in parcels]
+        most = max((part.shape[1] for part in tables), default=1)
         table = np.full((len(rows), most), none, dtype=np.int32)
-        for at, (part, _) in enumerate(parcels):
+        for at, part in enumerate(tables):
             table[at * PARCEL : at * PARCEL + len(part), : part.shape[1]] = part
-        everything = np.concatenate([part[1] for part in parcels]) if parcels else np.zeros(0, dtype=bool)
+        everything = np.concatenate([part.everything for part in parcels]) if parcels else np.zeros(0, dtype=bool)
         return Painting(sensor.ideal.shape, view.window, table, everything, ~view.shown.ravel())
 
     def painted(self, frame: Bits) -> NDArray[np.uint8]:
@@ -84,48 +86,81 @@ class Painting:
         return seen
 
 
-def painted(frame: Bits, sensor: SensorMap) -> NDArray[np.uint8]:
-    """The ideal frame, uint8 of {0, 1}, of one frame (height, width) of the sensor, for a map that is this frame's own."""
-    view = View.of(sensor)
-    rows, columns = np.nonzero(frame[view.window])
-    canvas = np.zeros(sensor.ideal.height * sensor.ideal.width + 1, dtype=np.uint8)
-    canvas[:-1] = ~view.shown.ravel()
-    if len(rows):
-        table, everything = what_pixels_show(sensor, rows + view.window[0].start, columns + view.window[1].start)
-        canvas[table] = 1
-        if everything.any():
+@dataclass(frozen=True)
+class Painted:
+    """One frame of the sensor painted by a map that is this frame's own, within a window of the ideal frame; beyond it all is lit."""
+
+    ideal: NDArray[np.uint8]
+    """The ideal frame, (height, width) of {0, 1}."""
+    rows: Integers
+    columns: Integers
+    """Of the sensor's lit pixels, (lit,), of those that may show something of the window."""
+    shown: Shown
+
+    @staticmethod
+    def of(frame: Bits, sensor: SensorMap, outline: Outline, window: Window | None = None) -> Painted:
+        """Of a frame (height, width) of the sensor, whose outline this is; by default all of the ideal frame is painted."""
+        view = View.of(sensor, outline, window)
+        rows, columns = np.nonzero(frame[view.window])
+        rows, columns = rows + view.window[0].start, columns + view.window[1].start
+        canvas = np.ones(sensor.ideal.height * sensor.ideal.width + 1, dtype=np.uint8)
+        ideal = canvas[:-1].reshape(sensor.ideal.shape)
+        ideal[view.shown_in] = ~view.shown
+        shown = what_pixels_show(sensor, rows, columns)
+        canvas[shown.pixels] = 1
+        if shown.everything.any():
             canvas[:] = 1
-    return canvas[:-1].reshape(sensor.ideal.shape)
+        return Painted(ideal, rows, columns, shown)
+
+    def within(self, mask: Bits, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """What a frame of the sensor has lit that shows some pixel of a mask of the ideal frame: uint8 of {0, 1}."""
+        shows = np.append(mask.ravel(), False)[self.shown.pixels].any(axis=0) | (self.shown.everything & mask.any())
+        within, rows, columns = np.zeros_like(frame), self.rows[shows], self.columns[shows]
+        within[rows, columns] = frame[rows, columns]
+        return within
 
 
 @dataclass(frozen=True)
 class View:
-    """What the sensor shows of the ideal frame: `window`, the rows and columns of the sensor outside which it shows nothing of it, and
-    `shown`, the ideal pixels, (height, width), that it shows as a whole, whatever the rotation and calibration.
+    """What the sensor shows of the ideal frame, or of a window of it: `window`, the rows and columns of the sensor outside which it shows
+    nothing of that, and `shown`, the pixels in rows and columns `shown_in` of the ideal frame, all of those that are looked at, that the
+    sensor shows as a whole, whatever the rotation and calibration.
     """
 
-    window: tuple[slice, slice]
+    window: Window
     shown: Bits
+    shown_in: Window
 
     @staticmethod
-    def of(sensor: SensorMap) -> View:
-        """Of blocks of the ideal frame, and of the pixels of those that the sensor's border may cut."""
+    def of(sensor: SensorMap, outline: Outline | None = None, window: Window | None = None) -> View:
+        """By the sensor's outline; where that does not tell, of blocks of the ideal frame, and of the pixels of those that the sensor's
+        border may cut.
+        """
         height, width = sensor.ideal.shape
-        tops, lefts = np.arange(0, height, BLOCK_PX), np.arange(0, width, BLOCK_PX)
+        rows, columns = window or (slice(0, height), slice(0, width))
+        shown_in = slice(rows.start, min(rows.stop, height)), slice(columns.start, min(columns.stop, width))
+        seen = None
+        if outline is not None:
+            seen, whole = outline.seen(sensor, shown_in)
+            if whole:
+                return View(seen, np.ones([side.stop - side.start for side in shown_in], dtype=bool), shown_in)
+        tops, lefts = (np.arange(side.start, side.stop, BLOCK_PX) for side in shown_in)
         column, row = _shown_squares(sensor, tops[:, None], lefts[None, :], BLOCK_PX)
-        window = _within(row, sensor.camera.height), _within(column, sensor.camera.width)
+        seen = seen or (_within(row, sensor.camera.height), _within(column, sensor.camera.width))
         inside = _inside(sensor, column, row)
-        shown = inside.repeat(BLOCK_PX, axis=0).repeat(BLOCK_PX, axis=1)[:height, :width]
+        shown = inside.repeat(BLOCK_PX, axis=0).repeat(BLOCK_PX, axis=1)[
+            : shown_in[0].stop - rows.start, : shown_in[1].stop - columns.start
+        ]
         out = (column[1] <= 0) | (column[0] >= sensor.camera.width) | (row[1] <= 0) | (row[0] >= sensor.camera.height)
         unsure = np.nonzero(~inside & ~out)
         if len(unsure[0]):
             offsets = np.arange(BLOCK_PX)
-            rows, columns = tops[unsure[0], None, None] + offsets[:, None], lefts[unsure[1], None, None] + offsets
-            rows, columns = (side.ravel() for side in np.broadcast_arrays(rows, columns))
-            kept = (rows < height) & (columns < width)
-            rows, columns = rows[kept], columns[kept]
-            shown[rows, columns] = _inside(sensor, *_shown_squares(sensor, rows, columns, 1))
-        return View(window, shown)
+            down, aside = tops[unsure[0], None, None] + offsets[:, None], lefts[unsure[1], None, None] + offsets
+            down, aside = (side.ravel() for side in np.broadcast_arrays(down, aside))
+            kept = (down < shown_in[0].stop) & (aside < shown_in[1].stop)
+            down, aside = down[kept], aside[kept]
+            shown[down - rows.start, aside - columns.start] = _inside(sensor, *_shown_squares(sensor, down, aside, 1))
+        return View(seen, shown, shown_in)
 
 
 def _shown_squares(sensor: SensorMap, rows: Integers, columns: Integers, size: int) -> tuple[Interval, Interval]:
@@ -145,8 +180,24 @@ def _within(side: Interval, size: int) -> slice:
     return slice(math.floor(low), math.ceil(high))
 
 
-def what_pixels_show(sensor: SensorMap, rows: Integers, columns: Integers) -> tuple[NDArray[np.int32], Bits]:
-    """Flat numbers of the ideal pixels that each of some pixels of the sensor paints, (pixels, most), and which paint everything.
+@dataclass(frozen=True)
+class Shown:
+    """What pixels of the sensor show: `pixels`, flat numbers of the ideal pixels that each paints, (most, pixels), that of none, height *
+    width, among them, and `everything`, those that paint everything.
+    """
+
+    pixels: Integers
+    everything: Bits
+
+    def table(self, none: int) -> NDArray[np.int32]:
+        """The numbers of each, (pixels, most), ascending, as few columns as they need."""
+        ordered = np.sort(self.pixels.astype(np.int32), axis=0)
+        most = int((ordered < none).sum(axis=0).max(initial=1))
+        return ordered[: max(most, 1)].T
+
+
+def what_pixels_show(sensor: SensorMap, rows: Integers, columns: Integers) -> Shown:
+    """What some pixels of the sensor show.
 
     Ideal pixels of the box around the quadrilateral are left out where one of its edges, moved outward, has them on its other side.
     """
@@ -170,9 +221,7 @@ def what_pixels_show(sensor: SensorMap, rows: Integers, columns: Integers) -> tu
     met = (row <= bottom) & (column <= right) & (row >= 0) & (row < height) & (column >= 0) & (column < width)
     for across, along, limit in limits:
         met &= across * aside + along * down <= limit
-    ordered = np.sort(np.where(met & ~none, row * width + column, height * width).astype(np.int32), axis=0)
-    most = int((ordered < height * width).sum(axis=0).max(initial=1))
-    return ordered[: max(most, 1)].T, everything
+    return Shown(np.where(met & ~none, row * width + column, height * width), everything)
 
 
 def _limits(u: Interval, v: Interval, bow: float) -> list[tuple[Floats, Floats, Floats]]:

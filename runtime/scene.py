@@ -389,8 +389,6 @@ class Scene:
         ahead = -widest <= flattest and steepest <= widest
         _demand(ahead, "domain", "a state with the runway behind the camera (Z <= 0)", "narrow theta_rad, y_m or z_m")
         self._check_margin(nearest, farthest)
-        told = self.attitude is None or self.calibration.exact
-        _demand(told, "attitude", "a roll or yaw beside a plus-minus in [calibration]", "add that of roll and yaw to [attitude] instead")
 
     def _check_margin(self, nearest: float, farthest: float) -> None:
         """The margin of `runtime.rounding` is twice float64's error on rows and columns in view, or more. Raises `SceneError`.

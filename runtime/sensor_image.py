@@ -12,6 +12,7 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from runtime.attitude import Attitude, rotation_at
 from runtime.camera import project
 from runtime.lens import Lens
 from runtime.rounding import OUTWARD_PX
@@ -22,20 +23,25 @@ Floats = NDArray[np.float64]
 
 STEP_PX = 2.0**-4
 """A curve is followed in steps no longer than this."""
+LEAST_DEPTH = 2.0**-8
+"""A turned ray whose depth is not above this, per unit of its own, is not drawn."""
 DRAWN_POINTS = 33
 """Points of a curve that is drawn."""
 
 
-def sensor_curves(scene: Scene, states: ArrayLike, points: int = DRAWN_POINTS) -> Floats:
+def sensor_curves(scene: Scene, states: ArrayLike, points: int = DRAWN_POINTS, attitude: Attitude | None = None) -> Floats:
     """Every marking as the scene's camera shows it, from near to far: (..., markings, points, 2), (u, v) px of the sensor.
 
-    Of a pinhole the two ends, as `runtime.camera.project` has them. NaN where a lens shows nothing of a marking.
+    Of a pinhole the two ends, as `runtime.camera.project` has them. NaN where a lens shows nothing of a marking. `attitude`: of a camera
+    with its roll and yaw in the middle; theta is the camera's own pitch, and a marking is drawn as far as it lies before the camera.
     """
     camera = scene.camera
-    if camera.pinhole:
+    if camera.pinhole and attitude is None:
         return project(scene, states)
-    lens = _lens(camera)
-    first, last = _within_disc(lens, _tangents(scene, states))
+    lens, ends = _lens(camera), _tangents(scene, states) if attitude is None else _turned_tangents(scene, states, attitude)
+    if camera.pinhole:
+        return _shown(camera, lens, ends)
+    first, last = _within_disc(lens, ends)
     share = np.linspace(0, 1, points)[:, None]
     along = first[..., None, :] * (1 - share) + last[..., None, :] * share
     return _shown(camera, lens, along)
@@ -80,6 +86,17 @@ def _tangents(scene: Scene, states: ArrayLike) -> Floats:
     camera = scene.camera
     ends = project(scene, states)
     return (ends - [camera.u0, camera.v0]) / [camera.focal_u_px, camera.focal_v_px]
+
+
+def _turned_tangents(scene: Scene, states: ArrayLike, attitude: Attitude) -> Floats:
+    """The same as a rolled and yawed camera sees them; NaN of an end that does not lie before it."""
+    given = np.asarray(states, dtype=np.float64)
+    a, b, c = (side[..., None, None] for side in rotation_at(given[..., 0], attitude))
+    x, y = np.moveaxis(_tangents(scene, np.concatenate([c[..., 0], given[..., 1:]], axis=-1)), -1, 0)
+    right, depth = x * np.cos(b) + np.sin(b), np.cos(b) - x * np.sin(b)
+    depth = np.where(depth > LEAST_DEPTH, depth, np.nan)
+    turned = right * np.cos(a) - y * np.sin(a), right * np.sin(a) + y * np.cos(a)
+    return np.stack([side / depth for side in turned], axis=-1)
 
 
 def _within_disc(lens: Lens, ends: Floats) -> tuple[Floats, Floats]:

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from runtime.lens import Lens
 from runtime.refine.interval import Floats, Interval
 from runtime.rounding import ROUNDING_SHARE
-from runtime.scene import Calibration, Camera, Scene, SceneError
+from runtime.scene import MARGIN_PX, Calibration, Camera, Scene, SceneError
 from runtime.turn import cosine_and_sine
 
 Integers = NDArray[np.int64]
@@ -93,11 +93,7 @@ class SensorMap:
         """
         camera, off = scene.camera, scene.calibration
         lens = lens_of(camera, off)
-        sides = np.arange(camera.width + 1.0), np.arange(camera.height + 1.0)
-        columns, rows = np.meshgrid(*sides)
-        rays = _rays(camera, off, lens, columns, rows)
-        for array in rays:
-            array.flags.writeable = False
+        rays = corner_rays(camera, lens, off)
         still = SensorMap(camera, ideal_camera(scene), off, lens, None, rays)
         if turn is None and (off.roll_rad or off.yaw_rad):
             turn = (-off.roll_rad, off.roll_rad), (-off.yaw_rad, off.yaw_rad)
@@ -121,9 +117,7 @@ class SensorMap:
 
         Without bounds where the box is not certainly within the disc of the lens (`Lens.radius`).
         """
-        x, y = _tangents(u, self.ideal.focal_u_px, self.ideal.u0), _tangents(v, self.ideal.focal_v_px, self.ideal.v0)
-        if self.turn is not None:
-            x, y = _sensor_rays(self.turn, x, y)
+        x, y = self._lens_rays(u, v)
         farthest = np.sqrt(np.maximum(-x[0], x[1]) ** 2 + np.maximum(-y[0], y[1]) ** 2) * (1 + ROUNDING_SHARE)
         seen = farthest <= self.lens.radius
         x, y = ((np.where(seen, side[0], 0.0), np.where(seen, side[1], 0.0)) for side in (x, y))
@@ -134,6 +128,14 @@ class SensorMap:
             for side, focal, centre in zip(shown, (camera.focal_u_px, camera.focal_v_px), (camera.u0, camera.v0), strict=True)
         )
         return _where(seen, column), _where(seen, row)
+
+    def lens_rays(self, u: Floats, v: Floats) -> tuple[Interval, Interval]:
+        """(s, t): an outward enclosure of the rays that the lens is given of points of the ideal frame; without bounds where not seen."""
+        return self._lens_rays((u, u), (v, v))
+
+    def _lens_rays(self, u: Interval, v: Interval) -> tuple[Interval, Interval]:
+        x, y = _tangents(u, self.ideal.focal_u_px, self.ideal.u0), _tangents(v, self.ideal.focal_v_px, self.ideal.v0)
+        return (x, y) if self.turn is None else _sensor_rays(self.turn, x, y)
 
     @cached_property
     def bow_px(self) -> float:
@@ -177,6 +179,15 @@ def lens_of(camera: Camera, off: Calibration) -> Lens:
     return Lens.of(camera.distortion, math.hypot(across, down) * (1 + ROUNDING_SHARE))
 
 
+def corner_rays(camera: Camera, lens: Lens, off: Calibration | None = None) -> tuple[Floats, Floats, Floats]:
+    """Of every corner of the sensor's pixels, (height + 1, width + 1) each: the lens's ray (s, t), and how far from it the true one is."""
+    columns, rows = np.meshgrid(np.arange(camera.width + 1.0), np.arange(camera.height + 1.0))
+    rays = _rays(camera, off or Calibration(), lens, columns, rows)
+    for array in rays:
+        array.flags.writeable = False
+    return rays
+
+
 def ideal_camera(scene: Scene) -> Camera:
     """The ideal frame of a scene's camera: the camera itself where that is a pinhole.
 
@@ -198,6 +209,14 @@ def ideal_camera(scene: Scene) -> Camera:
         )
     focal_px = camera.focal_u_px, camera.focal_v_px
     return Camera(right - left, bottom - top, principal_point=(float(-left), float(-top)), focal_px=focal_px)
+
+
+def runway_beyond(scene: Scene) -> bool:
+    """False if the frame of a scene's pinhole certainly holds every point of the runway, in every state of the domain."""
+    camera, ((left, right), (top, bottom)) = scene.camera, _reached_by_runway(scene)
+    least = camera.u0 + camera.focal_u_px * left, camera.v0 + camera.focal_v_px * top
+    most = camera.width - camera.u0 - camera.focal_u_px * right, camera.height - camera.v0 - camera.focal_v_px * bottom
+    return not min(*least, *most) > MARGIN_PX
 
 
 def _seen_by_sensor(camera: Camera, off: Calibration) -> tuple[Angle, Angle]:

@@ -93,11 +93,11 @@ class Tracker:
         `Estimator.estimate` does, and ValueError for a time that is not finite and for a displacement of another axis, or of bounds that
         are not ordered; the tracker is then as it was before, and the displacement told next is since the update before.
         """
-        now_us, attitude = instant(time_us), attitude or self.estimator.attitude
+        now_us, told, attitude = instant(time_us), attitude, self.estimator.known_attitude(attitude)
         step = self._step(now_us, displacement)
         if step is None:
             self.late += 1
-            return self.estimator.estimate(frame, prior=prior, attitude=attitude)
+            return self.estimator.estimate(frame, prior=prior, attitude=told)
         found = self.estimator.find(frame, attitude)
         self._time_us, self._attitude = now_us, attitude
         self._earlier = tuple(seen.later(step) for seen in self._earlier)

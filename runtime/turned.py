@@ -23,16 +23,15 @@ from runtime.estimate import Box
 from runtime.model.entries import Entries
 from runtime.model.format import OVERFLOW
 from runtime.motion import STEEPEST_RAD
-from runtime.painting import painted
-from runtime.refine.lit_pixels import LitPixels
+from runtime.on_sensor import refined
+from runtime.outline import Window
+from runtime.painting import Painted
 from runtime.refine.refiner import Refiner, joined
 from runtime.refine.regions import regions_of
-from runtime.refine.sensor_borders import SensorBorders
-from runtime.refine.slices import INTERVALS, rereferenced
 from runtime.refine.witnesses import witnesses
 from runtime.scene import Camera, Scene
 from runtime.sensor import Sensor
-from runtime.sensor_map import SensorMap, Turn
+from runtime.sensor_map import LARGEST_ANGLE_RAD, SensorMap, Turn
 from runtime.state_set import StateSet
 
 Floats = NDArray[np.float64]
@@ -40,16 +39,8 @@ Bits = NDArray[np.bool_]
 
 BLUR_PX = 2.0
 """Bins of pitch, yaw and roll are so narrow that none moves a point of the ideal frame by much more than this."""
-BEYOND_PX = 2
-"""How far beyond where the sets show their markings the refinement looks at pixels; those farther out it takes for lit."""
 MOST_BINS = 4096
 """More runs of NN_F than this are not made: bins are wider then."""
-MOST_ENTRIES = 512
-"""More passing entries than this are refined as hulls of them."""
-FIRST_ROW_STEP = 2.0**-5
-"""Tangent of the rows that reference rows are put together by, at first."""
-MOST_DOUBLINGS = 6
-"""How often bins of scale and of reference rows are doubled for that."""
 
 
 @dataclass(frozen=True)
@@ -102,23 +93,13 @@ class TurnedStart:
     attitude: Attitude
     lit: Bits
     """The sensor's frame, (height, width), dilated by the tolerance: what lies beyond it is lit."""
-    parts: tuple[tuple[NDArray[np.uint8], StateSet], ...]
-    """For every bin its painted frame, and the entries that pass there, with its roll and yaw."""
+    parts: tuple[StateSet, ...]
+    """For every bin the entries that pass on its painted frame, with its roll and yaw."""
 
     def left(self, refiner: Refiner, cut: Callable[[StateSet], StateSet] | None, refine: bool) -> StateSet:
-        """What of the entries is consistent with the frame, and with what is known besides, to which `cut` cuts.
-
-        Behind a lens, each bin's entries are refined on its painted frame; else all of them on the sensor's own pixels.
-        """
-        parts = [(frame, sets if cut is None else cut(sets)) for frame, sets in self.parts]
-        together = joined(*(sets for _, sets in parts))
-        if not refine or len(together) == 0:
-            return together
-        if self.sensor.map is not None:
-            return joined(*(_refined_painted(refiner, frame, sets, cut is not None) for frame, sets in parts if len(sets)))
-        together, scene = grouped(together, MOST_ENTRIES), refiner.scene
-        sensor = replace(refiner, extra_budget=-1, window=window_of(scene, together))
-        return sensor.refine(self.lit, together, narrowed=cut is not None)
+        """What of the entries is consistent with the sensor's frame, and with what is known besides, to which `cut` cuts."""
+        together = joined(*(sets if cut is None else cut(sets) for sets in self.parts))
+        return refined(refiner, self.sensor.optics, self.lit, together, cut is not None) if refine else together
 
     def regions(self, left: StateSet, domain: Box, parts: Sequence[NDArray[np.int64]] | None) -> tuple[Box, ...]:
         """Boxes around parts of what is left, by the camera's pitch; `domain` is of the pitch that the ideal frame shows."""
@@ -138,15 +119,6 @@ class TurnedStart:
         return (*attitude_assumptions(self.sensor.scene, str(self.attitude), len(self.parts)), *otherwise[2:])
 
 
-def _refined_painted(refiner: Refiner, frame: NDArray[np.uint8], sets: StateSet, narrowed: bool) -> StateSet:
-    """What of the entries of a bin is consistent with its painted frame, with the bin's roll and yaw."""
-    level = replace(sets, roll=None, yaw=None)
-    left = replace(refiner, extra_budget=-1).refine(frame.view(np.bool_), level, narrowed=narrowed)
-    assert sets.roll is not None
-    assert sets.yaw is not None
-    return replace(left, roll=np.repeat(sets.roll[:1], len(left), axis=0), yaw=np.repeat(sets.yaw[:1], len(left), axis=0))
-
-
 def started(
     sensor: Sensor,
     entries: Entries,
@@ -154,24 +126,31 @@ def started(
     pixels: NDArray[np.uint8],
     attitude: Attitude,
     seen: Box | None,
+    beside_px: int,
+    window: Window,
 ) -> tuple[dict[str, Any], TurnedStart]:
-    """NN_F's outputs on the painted frames of all bins, taken together, and what of the bank passes.
+    """NN_F's outputs on the painted frames of all bins, taken together, `filtered` in the sensor's frame, and what of the bank passes.
 
     `run`: NN_F on a frame, with the budget of missed pixels times a number. `pixels`: the sensor's frame. `seen`: a box that holds the
-    state, with the pitch that the ideal frame shows; None if there is none.
+    state, with the pitch that the ideal frame shows; None if there is none. `beside_px`: how far beside its place a pixel may fire.
+    `window`: of the ideal frame, what is looked at.
     """
     scene = sensor.ideal
-    lit = witnesses(pixels.view(np.bool_), sensor.scene.tolerance.line_px)
+    lit = witnesses(pixels.view(np.bool_), beside_px)
     if seen is None:
-        outputs = run(np.zeros(scene.camera.shape, dtype=np.uint8), 1)
-        return outputs, TurnedStart(sensor, attitude, lit, ((pixels, _with(entries.all[:0], attitude)),))
+        outputs = {**run(np.zeros(scene.camera.shape, dtype=np.uint8), 1), "filtered": np.zeros_like(pixels)}
+        return outputs, TurnedStart(sensor, attitude, lit, (_with(entries.all[:0], attitude),))
     together: dict[str, Any] = {}
     parts = []
     for each in bins_of(scene.camera, attitude, (float(seen.lower[0]), float(seen.upper[0]))):
         turns = each.turns
-        frame = painted(lit, turned_map(sensor, turns))
-        outputs = run(frame, met_by_one(scene, turns))
-        parts.append((frame, each.of(entries.sets(outputs["passes"]))))
+        map_of_bin = turned_map(sensor, turns)
+        painted = Painted.of(lit, map_of_bin, sensor.outline, window)
+        outputs = run(painted.ideal, met_by_one(scene, turns, sensor.still))
+        outputs["filtered"] = painted.within(outputs["filtered"].view(np.bool_), pixels)
+        if sensor.runway_beyond:
+            outputs["filtered"] |= pixels & sensor.outline.not_within(map_of_bin)
+        parts.append(each.of(entries.sets(outputs["passes"])))
         together = _together(together, outputs)
     return together, TurnedStart(sensor, attitude, lit, tuple(parts))
 
@@ -180,6 +159,16 @@ def turned_map(sensor: Sensor, turns: Turns) -> SensorMap:
     """The map of a sensor for the rotations of one set."""
     a, b = ((float(cosine[0]), float(sine[0]), float(off[0])) for cosine, sine, off in _sides(turns))
     return replace(sensor.still, turn=Turn(a, b))
+
+
+def seen_by_turned(sensor: Sensor, mask: Bits, attitude: Attitude, pitch: float, window: Window) -> Bits:
+    """The pixels of the sensor that show some pixel of a mask of the ideal frame, within its window: for one pitch that this shows, and
+    the attitude's middle. For drawing.
+    """
+    sides = (np.array([[side, side]]) for side in (pitch, attitude.roll_rad, attitude.yaw_rad))
+    every = np.ones(sensor.scene.camera.shape, dtype=np.uint8)
+    whole = Painted.of(every.view(np.bool_), turned_map(sensor, Turns.of(*sides)), sensor.outline, window)
+    return whole.within(mask, every).view(np.bool_)
 
 
 def _sides(turns: Turns) -> tuple[tuple[Floats, Floats, Floats], ...]:
@@ -204,82 +193,48 @@ def _together(before: dict[str, Any], outputs: dict[str, Any]) -> dict[str, Any]
     return both
 
 
-def grouped(sets: StateSet, most: int) -> StateSet:
-    """At most about so many sets that hold the given ones: hulls of those that differ in x, roll and yaw alone, or in little else.
-
-    Their ends' rows then stay as narrow as those of the entries, which have one pitch, one scale and one distance but for a bin of each.
-    Bins of the scale are doubled until there are few enough.
-    """
-    if len(sets) <= most:
-        return sets
-    pitch, scale = (getattr(sets, name).mean(axis=1) for name in ("theta", "scale"))
-    pitch_step, scale_step = (float(np.median(np.ptp(getattr(sets, name), axis=1))) for name in ("theta", "scale"))
-    distance = np.unique(sets.z, axis=0, return_inverse=True)[1].ravel()
-    place, row_step = np.zeros(len(sets), dtype=np.int64), FIRST_ROW_STEP
-    for _ in range(MOST_DOUBLINGS):
-        keys = np.stack([np.floor(side) for side in (pitch / pitch_step, sets.tangent / row_step, distance, scale / scale_step)], axis=-1)
-        place = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
-        if place.max() < most:
-            break
-        scale_step, row_step = 2 * scale_step, 2 * row_step
-    return hulls_of(sets, place)
-
-
-def hulls_of(sets: StateSet, place: NDArray[np.int64]) -> StateSet:
-    """The hull of the sets at each place, from 0 on without a gap, with its scale at the lowest of their reference rows."""
-    count = int(place.max()) + 1
-    tangent, hulls = np.full(count, -np.inf), {}
-    np.maximum.at(tangent, place, sets.tangent)
-    sets = rereferenced(sets, tangent[place])
-    for name in (*INTERVALS, "roll", "yaw"):
-        side = getattr(sets, name)
-        low, high = np.full(count, np.inf), np.full(count, -np.inf)
-        np.minimum.at(low, place, side[:, 0])
-        np.maximum.at(high, place, side[:, 1])
-        hulls[name] = np.stack([low, high], axis=-1)
-    return StateSet(**hulls, tangent=tangent)
-
-
-def met_by_one(scene: Scene, turns: Turns) -> int:
+def met_by_one(scene: Scene, turns: Turns, still: SensorMap | None = None) -> int:
     """Most pixels of the ideal frame that all markings together can meet inside what one pixel of the sensor shows.
 
     With S' = cos(a) S + sin(a) T, d(X/Z)/dS' = 1/Z^2 and d(Y/Z) = dT'/Z - Y sin(b) dS'/Z^2. What spans w px meets at most floor(w) + 2
-    columns or rows, and a straight line in so many columns and rows one pixel fewer than they are together.
+    columns or rows, and a straight line in so many columns and rows one pixel fewer than they are together. `still`: the sensor's map,
+    where that is no pinhole with the ideal frame's own focal lengths.
     """
     camera = scene.camera
     cos_a, sin_a, sin_b = (float(np.abs(side[0])) + float(off[0]) for side, off in _sizes(turns))
-    sides = np.abs([camera.u0, camera.width - camera.u0]).max() / camera.focal_u_px
-    heights = np.abs([camera.v0, camera.height - camera.v0]).max() / camera.focal_v_px
+    sides, heights, wide, tall = _of_a_pixel(camera, turns, still)
     aside, down = cos_a * sides + sin_a * heights, cos_a * heights + sin_a * sides
     ahead = float(turns.cos_b[0] - turns.off_b[0]) - sin_b * aside
     if ahead <= 0:
         return camera.width * camera.height
-    across, fall = cos_a / camera.focal_u_px + sin_a / camera.focal_v_px, cos_a / camera.focal_v_px + sin_a / camera.focal_u_px
+    across, fall = cos_a * wide + sin_a * tall, cos_a * tall + sin_a * wide
     spans = camera.focal_u_px * across / ahead**2, camera.focal_v_px * (fall / ahead + down * sin_b * across / ahead**2)
     columns, rows = (math.floor(span * (1 + 2.0**-30)) + 2 for span in spans)
     return min(columns * rows, len(scene.runway.markings) * (columns + rows - 1))
 
 
+def _of_a_pixel(camera: Camera, turns: Turns, still: SensorMap | None) -> tuple[float, float, float, float]:
+    """Largest |S| and |T| of rays that the ideal frame can show, and the width and height in rays of what a pixel shows.
+
+    A step of h in the sensor's frame is J^-1 h, J the lens's Jacobian with eigenvalues from l to L: along itself at most h/l, across
+    h (1/l - 1/L)/2.
+    """
+    sides = float(np.abs([camera.u0, camera.width - camera.u0]).max() / camera.focal_u_px)
+    heights = float(np.abs([camera.v0, camera.height - camera.v0]).max() / camera.focal_v_px)
+    wide, tall = 1 / camera.focal_u_px, 1 / camera.focal_v_px
+    if still is None or (still.lens.model is None and still.calibration.exact):
+        return sides, heights, wide, tall
+    zoom = 1 / (1 - still.calibration.focal_relative)
+    angle = math.atan(math.hypot(sides, heights)) + math.asin(min(float(np.abs(turns.sin_b[0]) + turns.off_b[0]), 1.0))
+    farthest = min(math.tan(angle), still.lens.radius) if angle < LARGEST_ANGLE_RAD else still.lens.radius
+    step = zoom * max(wide, tall) / still.lens.stretch
+    least = still.lens.stretch_within(farthest + 2 * step) if farthest + 2 * step < still.lens.radius else still.lens.stretch
+    along, beside = zoom / least, zoom * (1 / least - 1 / still.lens.largest_scale) / 2
+    return farthest, farthest, along * wide + beside * tall, along * tall + beside * wide
+
+
 def _sizes(turns: Turns) -> tuple[tuple[Floats, Floats], ...]:
     return (turns.cos_a, turns.off_a), (turns.sin_a, turns.off_a), (turns.sin_b, turns.off_b)
-
-
-def window_of(scene: Scene, sets: StateSet) -> tuple[slice, slice]:
-    """The rows and columns of the sensor that show what the sets may show, with a margin of `BEYOND_PX`."""
-    camera = scene.camera
-    borders = SensorBorders.of(
-        scene, sets, LitPixels.of(np.zeros(camera.shape, dtype=bool), (slice(0, camera.height), slice(0, camera.width)), True)
-    )
-    low, high = borders.columns
-    sides = (
-        (min(borders.far[0].min(), borders.near[0].min()), max(borders.far[1].max(), borders.near[1].max()), camera.height),
-        (low.min(), high.max(), camera.width),
-    )
-    rows, columns = (
-        slice(int(np.clip(np.floor(first) - BEYOND_PX, 0, size - 1)), int(np.clip(np.floor(last) + 1 + BEYOND_PX, 1, size)))
-        for first, last, size in sides
-    )
-    return rows, columns
 
 
 def seen_box(box: Box, attitude: Attitude) -> Box:

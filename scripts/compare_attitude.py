@@ -19,12 +19,11 @@ from typing import Annotated
 
 import numpy as np
 import typer
-from attitudes import Floats
 from compare_limit import constant_network
 from rational_image import RationalView
 from rich.progress import track
 from rich.table import Table
-from turned_state import TurnedState
+from turned_state import Floats, TurnedState
 
 from runtime import Box, Estimator, ModelError, Scene, terminal
 from runtime.errors import fail

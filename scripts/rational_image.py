@@ -7,7 +7,7 @@ end of a marking is projected without any rounding:
     u = u0 + F_u X/Z     v = v0 + F_v down/Z
 
 A camera that is off is turned by rational half-angle tangents too: first yawed, then rolled. Behind a lens a marking is a curve, of which
-pieces are enclosed in balls and halved until each lies in one pixel, or is shorter than anything that matters (`curved_image`). A pixel
+pieces are enclosed in balls and halved until each lies in one pixel, or is shorter than anything that matters (`curved_image.py`). A pixel
 is lit if a point of a closed segment lies in it; pixels are half-open, so that a point on the border of two belongs to the right or the
 lower one. Nothing here is shared with the packages that build and run a model: the scene comes as the plain tables of its file, whose
 float64 are taken exactly.
@@ -15,6 +15,7 @@ float64 are taken exactly.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -23,21 +24,15 @@ from typing import Any
 
 import flint
 import numpy as np
+from curved_image import BallLens, CurvedCamera
 from numpy.typing import NDArray
 
 Frame = NDArray[np.bool_]
 Point = tuple[Fraction, Fraction]
-BallPoint = tuple[flint.arb, flint.arb]
 
 SURE_RAD = 1e-12
 """Angles farther apart than this are told apart by float64, whose atan is right to some 1e-16."""
 FIRST_BITS = 128
-STEP_PX, BOW_PX = 0.25, 2.0**-8
-"""Steps in which a curve is followed, and how far within one it leaves its chord at most: h^2/8 of a curvature that is below 1/2 a px."""
-OUTWARD_PX, MOST_HALVINGS = 2.0**-20, 24
-"""How far out what counts as met may lie, and how often a step is halved at most."""
-LARGEST_STRETCH, MOST_STEPS = 2, 2**16
-"""By how much a lens lengthens a marking within the frame at most, and steps of one."""
 NEARLY_BESIDE = Fraction(1, 2**40)
 """Where a marking that runs from before to behind the camera is cut, as a share of what lies before it: far out of view."""
 
@@ -141,48 +136,6 @@ def _focal_lengths(camera: dict[str, Any]) -> tuple[Fraction, Fraction]:
 
 
 @dataclass(frozen=True)
-class BallLens:
-    """OpenCV's models of a lens, in balls."""
-
-    fisheye: bool
-    coefficients: tuple[Fraction, ...]
-
-    @staticmethod
-    def of(table: dict[str, Any]) -> BallLens:
-        """The lens of a scene's table `camera.distortion`."""
-        return BallLens(table["model"] == "fisheye", tuple(map(Fraction, table["coefficients"])))
-
-    def shown(self, x: flint.arb, y: flint.arb) -> tuple[flint.arb, flint.arb]:
-        """Where the rays of two balls are shown, in focal lengths."""
-        square = x**2 + y**2
-        k = [_ball(value) for value in self.coefficients]
-        if self.fisheye:
-            r = square.sqrt()
-            angle = r.atan()
-            scale = 1 + angle**2 * (k[0] + angle**2 * (k[1] + angle**2 * (k[2] + angle**2 * k[3])))
-            scale *= (1 / (1 + square)).union(flint.arb(1)) if r.contains(0) else angle / r
-            return x * scale, y * scale
-        k1, k2, p1, p2, k3 = [*k, flint.arb(0)][:5]
-        scale = 1 + square * (k1 + square * (k2 + square * k3))
-        return x * scale + 2 * p1 * x * y + p2 * (square + 2 * x**2), y * scale + p1 * (square + 2 * y**2) + 2 * p2 * x * y
-
-    def falls_back(self, x: flint.arb, y: flint.arb) -> bool:
-        """True if the lens may fold at some ray of the balls, where no frame shows it: its radial derivative is not certainly above 0."""
-        square = x**2 + y**2
-        if self.fisheye:
-            square = square.sqrt().atan() ** 2
-        slope, power = flint.arb(1), flint.arb(1)
-        for place, k in enumerate(self.coefficients if self.fisheye else (*self.coefficients[:2], *self.coefficients[4:])):
-            power *= square
-            slope += (2 * place + 3) * _ball(k) * power
-        return not slope > 0
-
-
-def _ball(value: Fraction) -> flint.arb:
-    return flint.arb(value.numerator) / value.denominator
-
-
-@dataclass(frozen=True)
 class RationalView:
     """A camera and what it looks at. `roll` and `yaw` are the tangents of half the angles by which the camera is off."""
 
@@ -218,12 +171,12 @@ class RationalView:
 
     def project(self, state: RationalState, p_x: Fraction, p_z: Fraction) -> Point:
         """(u, v) of the ground point (p_x, 0, p_z), px. Raises ValueError where it is not in front of the camera."""
-        right, down, depth = self._turned(state, p_x, p_z)
+        right, down, depth = self.in_camera(state, p_x, p_z)
         if depth <= 0:
             raise ValueError("the point lies behind the camera")
         return self.u0 + self.focal_u * right / depth, self.v0 + self.focal_v * down / depth
 
-    def _turned(self, state: RationalState, p_x: Fraction, p_z: Fraction) -> tuple[Fraction, Fraction, Fraction]:
+    def in_camera(self, state: RationalState, p_x: Fraction, p_z: Fraction) -> tuple[Fraction, Fraction, Fraction]:
         """The ground point in the camera's frame: to the right, down and ahead, m."""
         cosine, sine = turn(state.tangent)
         ahead = p_z + state.z
@@ -247,7 +200,7 @@ class RationalView:
     def _ahead(self, state: RationalState, stripe: Stripe) -> list[tuple[Fraction, Fraction]]:
         """The part of a stripe that lies in front of the camera, by its p_z; none if all of it is behind. The depth is affine in p_z."""
         near, far = stripe.near_z, stripe.far_z
-        start, stop = self._turned(state, stripe.x, near)[2], self._turned(state, stripe.x, far)[2]
+        start, stop = self.in_camera(state, stripe.x, near)[2], self.in_camera(state, stripe.x, far)[2]
         if start > 0 and stop > 0:
             return [(near, far)]
         if start <= 0 and stop <= 0:
@@ -260,86 +213,26 @@ class RationalView:
     def image(self, state: RationalState) -> RunwayImage:
         """Every pixel of the frame that a marking meets."""
         frame = np.zeros(self.shape, dtype=np.bool_)
-        pixels = set() if self.lens is None else curved_image(self, state)
-        for start, stop in self.segments(state) if self.lens is None else ():
-            for row, first, last in lit_columns(start, stop, self.height):
-                pixels.update((row, column) for column in range(max(first, 0), min(last, self.width - 1) + 1))
-        rows, columns = np.array(sorted(pixels), dtype=np.int64).reshape(-1, 2).T
-        frame[rows, columns] = True
-        return RunwayImage(frame, rows, columns)
+        if self.lens is None:
+            for start, stop in self.segments(state):
+                for row, first, last in lit_columns(start, stop, self.height):
+                    frame[row, max(first, 0) : max(last + 1, 0)] = True
+        else:
+            for start, stop in self._rays(state):
+                frame[self._curved.met(start, stop)] = True
+        return RunwayImage(frame, *np.nonzero(frame))
 
+    @functools.cached_property
+    def _curved(self) -> CurvedCamera:
+        """The camera as what shows rays through its lens."""
+        assert self.lens is not None
+        return CurvedCamera(self.lens, self.width, self.height, (self.focal_u, self.focal_v), (self.u0, self.v0))
 
-def curved_image(view: RationalView, state: RationalState) -> set[tuple[int, int]]:
-    """(row, column) of the pixels of the frame that a marking's curve meets, behind a lens: outward by `OUTWARD_PX`.
-
-    A marking is followed in steps of up to `STEP_PX`, between points that are enclosed in balls. Within a step the curve stays in the box
-    of its ends, widened; where that lies in two pixels side by side, both are met, and where it lies in four, the step is halved. A part
-    of a marking that runs on to where the lens folds, which no frame shows, ends there.
-    """
-    pixels: set[tuple[int, int]] = set()
-    with flint.ctx.workprec(64):
-        for stripe in view.stripes:
-            for near, far in view._ahead(state, stripe):
-                ends = [view._turned(state, stripe.x, p_z) for p_z in (near, far)]
-                rays = [(_ball(right / depth), _ball(down / depth)) for right, down, depth in ends]
-                _follow(_Curve(view, rays[0], rays[1]), pixels)
-    return pixels
-
-
-@dataclass(frozen=True)
-class _Curve:
-    """A segment of rays as a lens shows it."""
-
-    view: RationalView
-    start: BallPoint
-    stop: BallPoint
-
-    def at(self, share: Fraction) -> tuple[float, float, float, float] | None:
-        """Least column, largest, least row, largest, of the point at a share of the segment; None where the lens may fold."""
-        lens, part = self.view.lens, _ball(share)
-        assert lens is not None
-        x, y = (first + part * (last - first) for first, last in zip(self.start, self.stop, strict=True))
-        if lens.falls_back(x, y):
-            return None
-        shown = lens.shown(x, y)
-        column = _ball(self.view.u0) + _ball(self.view.focal_u) * shown[0]
-        row = _ball(self.view.v0) + _ball(self.view.focal_v) * shown[1]
-        return tuple(float(side) + sign * OUTWARD_PX / 2 for side, sign in ((column, -1), (column, 1), (row, -1), (row, 1)))  # pyright: ignore[reportReturnType]
-
-
-def _follow(curve: _Curve, pixels: set[tuple[int, int]]) -> None:
-    """Adds the pixels that a curve meets."""
-    view = curve.view
-    reach = sum(float(abs(first - last)) for first, last in zip(curve.start, curve.stop, strict=True))
-    steps = min(max(math.ceil(LARGEST_STRETCH * reach * float(max(view.focal_u, view.focal_v)) / STEP_PX), 1), MOST_STEPS)
-    pieces = [(Fraction(step, steps), Fraction(step + 1, steps), 0) for step in range(steps)]
-    known: dict[Fraction, tuple[float, float, float, float] | None] = {}
-    while pieces:
-        start, stop, depth = pieces.pop()
-        for share in (start, stop):
-            if share not in known:
-                known[share] = curve.at(share)
-        first, last = known[start], known[stop]
-        if first is None or last is None:
-            continue
-        bow = max(BOW_PX / 4**depth, OUTWARD_PX / 2)
-        left, right = math.floor(min(first[0], last[0]) - bow), math.floor(max(first[1], last[1]) + bow)
-        top, bottom = math.floor(min(first[2], last[2]) - bow), math.floor(max(first[3], last[3]) + bow)
-        if right < 0 or left >= view.width or bottom < 0 or top >= view.height:
-            continue
-        beside = (left < right) != (top < bottom) and right - left + bottom - top == 1
-        crosses = beside and math.floor(min(first[1], last[1])) + math.floor(min(first[3], last[3])) == left + top
-        crosses = crosses and math.floor(max(first[0], last[0])) + math.floor(max(first[2], last[2])) == right + bottom
-        single = left == right and top == bottom
-        if not (single or crosses or (bow <= OUTWARD_PX and beside)) and depth < MOST_HALVINGS:
-            middle = (start + stop) / 2
-            pieces += [(start, middle, depth + 1), (middle, stop, depth + 1)]
-            continue
-        pixels.update(
-            (row, column)
-            for row in range(max(top, 0), min(bottom, view.height - 1) + 1)
-            for column in range(max(left, 0), min(right, view.width - 1) + 1)
-        )
+    def _rays(self, state: RationalState) -> list[tuple[Point, Point]]:
+        """Right and down per depth of the near and the far end of each marking, as far as it lies in front of the camera."""
+        ends = [[self.in_camera(state, stripe.x, p_z) for p_z in part] for stripe in self.stripes for part in self._ahead(state, stripe)]
+        rays = [[(right / depth, down / depth) for right, down, depth in pair] for pair in ends]
+        return [(near, far) for near, far in rays]
 
 
 def lit_columns(start: Point, stop: Point, height: int) -> Iterator[tuple[int, int, int]]:

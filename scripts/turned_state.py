@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 from fractions import Fraction
 
@@ -12,8 +13,13 @@ from rational_image import RationalState, RationalView, turn
 
 from runtime import Scene
 from runtime.attitude import Attitude
+from runtime.scene import Mount
 
 Floats = NDArray[np.float64]
+Angles = tuple[arb, arb, arb]
+"""Roll, pitch down and yaw, rad, as balls."""
+Matrix = list[list[arb]]
+
 BITS = 200
 HAIR = 1e-13
 """A plus-minus that holds an angle whose float64 is rounded."""
@@ -33,18 +39,32 @@ class TurnedState:
         return TurnedState(RationalState.near(seen), Fraction(np.tan(a / 2)), Fraction(np.tan(b / 2)))
 
     def view(self, scene: Scene) -> RationalView:
-        """What the camera sees, exactly; a view's yaw is a turn of what is seen to the left, -b."""
-        return replace(RationalView.of(scene.to_dict()), roll=self.a, yaw=-self.b)
+        """What the camera sees, exactly."""
+        return self.turned(RationalView.of(scene.to_dict()))
+
+    def turned(self, view: RationalView) -> RationalView:
+        """A level view, turned; a view's yaw is a turn of what is seen to the left, -b."""
+        return replace(view, roll=self.a, yaw=-self.b)
 
     @property
-    def angles(self) -> tuple[arb, arb, arb]:
-        """Roll, theta and yaw of the camera as balls: read off the matrix."""
+    def angles(self) -> Angles:
+        """Roll, theta and yaw of the camera as balls."""
         with ctx.workprec(BITS):
-            (cos_a, sin_a), (cos_b, sin_b), (cos_c, sin_c) = (map(_ball, turn(half)) for half in (self.a, self.b, self.seen.tangent))
-            # the middle row, and the right and the middle column, of R_z(phi) R_x(theta) R_y(-psi)
-            down = cos_a * sin_b * sin_c - sin_a * cos_c, sin_a * sin_b * sin_c + cos_a * cos_c
-            forward = -sin_b, cos_b * cos_c
-            return -arb.atan2(-down[0], down[1]), (cos_b * sin_c).asin(), arb.atan2(*forward)
+            return _angles_of(self._rotation)
+
+    @property
+    def _rotation(self) -> Matrix:
+        """R_z(a) R_y(b) R_x(c)."""
+        (cos_a, sin_a), (cos_b, sin_b), (cos_c, sin_c) = (map(_ball, turn(half)) for half in (self.a, self.b, self.seen.tangent))
+        return _product(_z(cos_a, sin_a), _product(_y(cos_b, sin_b), _x(cos_c, sin_c)))
+
+    def aircraft(self, mount: Mount) -> Angles:
+        """The same of the aircraft in which the camera is mounted so: its rotation is R(mount)^T times the camera's."""
+        with ctx.workprec(BITS):
+            angles = (-arb(mount.roll_rad), arb(mount.pitch_down_rad), -arb(mount.yaw_rad))
+            roll, pitch, yaw = ((angle.cos(), angle.sin()) for angle in angles)
+            mounted = _product(_z(*roll), _product(_x(*pitch), _y(*yaw)))
+            return _angles_of(_product([list(column) for column in zip(*mounted, strict=True)], self._rotation))
 
     def attitude(self, rng: np.random.Generator, roll_plus_minus: float = 0.0, yaw_plus_minus: float = 0.0) -> Attitude:
         """A reading that is off by the plus-minus at most, which holds the true angles."""
@@ -57,11 +77,40 @@ class TurnedState:
 
     def within(self, lower: Floats, upper: Floats) -> bool:
         """Is the camera's state in this box, borders included?"""
-        theta = self.angles[1]
+        if self.b == 0:
+            return self.seen.within(lower, upper)
         rest = zip((self.seen.x, self.seen.y, self.seen.z), map(float, lower[1:]), map(float, upper[1:]), strict=True)
-        return bool(theta >= arb(float(lower[0])) and theta <= arb(float(upper[0]))) and all(
-            low <= value <= high for value, low, high in rest
-        )
+        return holds(float(lower[0]), self.angles[1], float(upper[0])) and all(low <= value <= high for value, low, high in rest)
+
+
+def holds(low: float, angle: arb, high: float) -> bool:
+    """True if a ball lies between two float64, borders included."""
+    return bool(angle >= arb(low)) and bool(angle <= arb(high))
+
+
+def _angles_of(rotation: Matrix) -> Angles:
+    """Of R_z(-roll) R_x(pitch down) R_y(-yaw): read off its middle column and its last row."""
+    (_, right, _), (_, down, _), (aside, ahead, depth) = rotation
+    return arb.atan2(right, down), ahead.asin(), arb.atan2(aside, depth)
+
+
+def _x(cosine: arb, sine: arb) -> Matrix:
+    return [[arb(1), arb(0), arb(0)], [arb(0), cosine, -sine], [arb(0), sine, cosine]]
+
+
+def _y(cosine: arb, sine: arb) -> Matrix:
+    return [[cosine, arb(0), sine], [arb(0), arb(1), arb(0)], [-sine, arb(0), cosine]]
+
+
+def _z(cosine: arb, sine: arb) -> Matrix:
+    return [[cosine, -sine, arb(0)], [sine, cosine, arb(0)], [arb(0), arb(0), arb(1)]]
+
+
+def _product(first: Matrix, second: Matrix) -> Matrix:
+    columns = list(zip(*second, strict=True))
+    products = [[sum((one * other for one, other in zip(row, column, strict=True)), arb(0)) for column in columns] for row in first]
+    assert all(isinstance(entry, arb) for entry in itertools.chain(*products))
+    return products
 
 
 def _ball(value: Fraction) -> arb:

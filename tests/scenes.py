@@ -146,8 +146,14 @@ WINDOWED = {
         bank=replace(FINAL.bank, places=8),
     ),
     "strip in windows": replace(STRIP, bank=WindowedBank(set_px=14.0, rows=10, places=32)),
+    "final, from the left": replace(
+        FINAL,
+        domain=replace(FINAL.domain, theta_rad=Edges((0.0, 0.02)), x_m=Edges((-24.0, -22.5)), z_m=Edges((900.0, 1100.0))),
+        bank=WindowedBank(set_px=24.0, rows=8, places=2),
+    ),
 }
-"""Scenes with a bank of windows, which have a model too; with few places, many frames overflow them."""
+"""Scenes with a bank of windows, which have a model too; with few places, many frames overflow them. Seen from the left of the runway, or
+from above its edge, windows begin where S of all cells does."""
 
 
 def states_of(scene: Scene) -> st.SearchStrategy[Floats]:

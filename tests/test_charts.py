@@ -63,7 +63,7 @@ def test_a_figure_has_the_size_and_the_colours_that_were_asked_for() -> None:
 
 def test_a_users_own_settings_change_no_chart() -> None:
     """As a matplotlibrc in the current folder or in the home has them; LaTeX may not even be there."""
-    history, sizes = history_of((0.5, 0.4, 0.6, None)), [Size("finer", 27, 1, 1, 1.0, 1.0, 2.0, 1.0, 1.0, 1.0)]
+    history, sizes = history_of((0.5, 0.4, 0.6, None)), [Size("finer", 27, 1, 1, 1.0, 1.0, 2.0, 1.0, 1.0, 1.0, 1.0)]
     expected = draw_history(SCENE, history), scale_chart(sizes)
     settings = {"text.usetex": True, "font.size": 40, "axes.grid": True, "axes.facecolor": "red", "lines.linestyle": ":"}
     with matplotlib.rc_context(settings):
@@ -115,7 +115,7 @@ def test_a_domain_of_one_state_has_a_history_without_panels() -> None:
 
 def test_both_families_start_at_the_first_scene_and_equal_ratios_are_equally_far() -> None:
     def size(family: str, cells: int, run_ms: float) -> Size:
-        return Size(family, cells, 1, 1, 1.0, 1.0, run_ms, 1.0, 1.0, 1.0)
+        return Size(family, cells, 1, 1, 1.0, 1.0, run_ms, 1.0, 1.0, 1.0, 1.0)
 
     sizes = [size("finer", 27, 0.3), *(size("finer", 27 * 8**step, 0.3 * 2**step) for step in (1, 2)), size("larger", 1728, 2.4)]
     picture = scale_chart(sizes)

@@ -14,12 +14,13 @@ import numpy as np
 import pytest
 import typer
 from numpy.typing import NDArray
+from scenes import FINAL
 from typer.testing import CliRunner
 
 from runtime import Estimator, Scene
 from runtime.camera import ground_scale, project, row_of_point
 from runtime.image import runway_image
-from runtime.scene import Axis
+from runtime.scene import Axis, Marking, Runway
 
 UNKNOWNS = [0, 2, 3]
 Floats = NDArray[np.float64]
@@ -146,29 +147,46 @@ def test_codac_finds_nothing_in_a_dark_frame_and_all_in_a_lit_one(paper_scene: S
     assert np.allclose(everything.upper, domain.upper[UNKNOWNS], atol=1e-12)
 
 
-def test_a_scene_with_free_x_is_refused_by_both(paper_scene: Scene) -> None:
+def test_a_scene_with_free_x_is_refused_by_codac_and_one_with_three_markings_by_the_baseline(paper_scene: Scene) -> None:
     domain = dataclasses.replace(paper_scene.domain, x_m=Axis((0.0,), 0.1))
-    scene = dataclasses.replace(paper_scene, domain=domain)
-    for comparison in (compare_codac.SetInversion, compare_opencv.Baseline):
-        with pytest.raises(ValueError, match="fixed"):
-            comparison(scene)
+    with pytest.raises(ValueError, match="fixed"):
+        compare_codac.SetInversion(dataclasses.replace(paper_scene, domain=domain))
+    markings = (*paper_scene.runway.markings, Marking("C", 0.0, 0.0, 0.3))
+    with pytest.raises(ValueError, match="two markings"):
+        compare_opencv.Baseline(dataclasses.replace(paper_scene, runway=Runway(markings)))
 
 
 # --- OpenCV ---
 
 
+@pytest.mark.parametrize("free_x", [False, True])
 @pytest.mark.parametrize("solver", compare_opencv.SOLVERS)
-def test_exact_measurements_give_the_exact_pose(paper_scene: Scene, random_states: Any, solver: str) -> None:
-    baseline = compare_opencv.Baseline(paper_scene)
-    for state in random_states(paper_scene, 20, 9):
-        theta, _, y, z = state
-        far, near = (float(row_of_point(paper_scene.camera, theta, y, end + z)) for end in (0.3, 0.0))
+def test_exact_measurements_give_the_exact_pose(paper_scene: Scene, random_states: Any, solver: str, free_x: bool) -> None:
+    scene = with_free_x(paper_scene) if free_x else paper_scene
+    baseline = compare_opencv.Baseline(scene)
+    for state in random_states(scene, 20, 9):
+        theta, x, y, z = state
+        far, near = (float(row_of_point(scene.camera, theta, y, end + z)) for end in (0.3, 0.0))
         v = np.tile(np.linspace(far, near, 30), 2)
-        across = np.repeat(paper_scene.runway.x_m, 30)
-        u = paper_scene.camera.u0 + across * ground_scale(paper_scene.camera, theta, y, v)
-        line = baseline._fitted(u, v, across)
-        measured = compare_opencv.Measured(u, v, across, near_row=near, far_row=far, line=line)
+        lateral = np.repeat(scene.runway.x_m, 30)
+        u = scene.camera.u0 + (lateral - x) * ground_scale(scene.camera, theta, y, v)
+        line = baseline._fitted(u, v, lateral)
+        measured = compare_opencv.Measured(u, v, lateral, near_row=near, far_row=far, line=line)
         assert np.allclose(baseline._solve(measured, solver), state, atol=1e-9 if solver == "least squares" else 1e-4)
+
+
+def with_free_x(scene: Scene) -> Scene:
+    return dataclasses.replace(scene, domain=dataclasses.replace(scene.domain, x_m=Axis((0.0,), 0.1)))
+
+
+@pytest.mark.parametrize("detector", compare_opencv.DETECTORS)
+def test_the_baseline_finds_a_runway_from_afar_and_beside_its_middle(detector: str) -> None:
+    cv2.setNumThreads(1)
+    baseline = compare_opencv.Baseline(FINAL)
+    for truth, frame in comparison_frames.draw_frames(FINAL, 6, 0.01, 3):
+        state = baseline.estimate(frame, detector, "least squares")
+        assert state is not None
+        assert (np.abs(state - truth) < [0.002, 2.0, 0.02 * truth[2], 0.1 * truth[3]]).all()
 
 
 @pytest.mark.parametrize("clutter", [0.0, 0.02, 0.05])

@@ -16,6 +16,8 @@ from rational_image import RationalState, RationalView, turn
 from scenes import PAPER, examples
 
 from runtime.refine.altitude import contract_by_altitude
+from runtime.refine.border_pairs import contract_by_border_pairs, horizon_bounds, scales_at_borders
+from runtime.refine.borders import Borders
 from runtime.refine.crossings import offsets_at_crossings
 from runtime.refine.end_pixels import offsets_at_ends
 from runtime.refine.ends import contract_by_ends
@@ -31,7 +33,12 @@ from runtime.state_set import StateSet, end_rows, tangent_of_row
 
 Frame = NDArray[np.bool_]
 WHOLE = slice(None), slice(None)
-CONTRACTORS = {"offsets": contract_by_offsets, "vouched": contract_by_vouched, "ends": contract_by_ends}
+CONTRACTORS = {
+    "offsets": contract_by_offsets,
+    "vouched": contract_by_vouched,
+    "border pairs": contract_by_border_pairs,
+    "ends": contract_by_ends,
+}
 SOURCES = {"crossings": offsets_at_crossings, "end pixels": offsets_at_ends, "vouched": offsets_by_vouched}
 
 
@@ -292,6 +299,47 @@ def test_offsets_tell_the_scale_and_the_track(case: Case) -> None:
         found = getattr(contract_by_offsets(wide.sets, sight), axis)[0]
         left = (high - low) / (abs(across) if axis == "scale" else scale)
         assert found[1] - found[0] <= left + 1e-5 * extent
+
+
+def all_pairs(row: list[float], low: list[float], high: list[float]) -> tuple[float, float]:
+    """What all pairs of borders say of T, one by one: g between `low` and `high` at rows v - v0, proportional to (v - v0) + T."""
+    least, most = -math.inf, math.inf
+    for one, other in itertools.product(range(len(row)), repeat=2):
+        if low[one] > 0 and high[other] < math.inf and low[one] != high[other]:
+            bound = low[one] * (row[other] - row[one]) / (high[other] - low[one]) - row[one]
+            least, most = (max(least, bound), most) if low[one] < high[other] else (least, min(most, bound))
+    return least, most
+
+
+@examples(60)
+@given(case=whole_markings(), extent=st.floats(1e-4, 1e-2), free=st.booleans())
+def test_border_pairs_come_to_what_all_pairs_say(case: Case, extent: float, free: bool) -> None:
+    """Repeated with the same frame; x free leaves the marking on one side, and so no more than a wider range of scales."""
+    wide = widened(case, theta=extent, **({"x": 0.1 * abs(case.scene.runway.x_m[0] - float(case.state.x))} if free else {}))
+    sight, camera = wide.seen(case.image, 0), case.scene.camera
+    assert isinstance(sight.borders, Borders)
+    low, high = (side[:, 0].tolist() for side in scales_at_borders(wide.sets, sight, sight.borders))
+    least, most = all_pairs((sight.borders.row[:, 0] - camera.v0).tolist(), low, high)
+    sets = wide.sets
+    for _ in range(8):
+        sets = contract_by_border_pairs(sets, sight)
+    start, stop = wide.sets.theta[0]
+    expected = max(start, math.atan(least / camera.focal_v_px)), min(stop, math.atan(most / camera.focal_v_px))
+    assert sets.theta[0].tolist() == pytest.approx(expected, abs=1e-7 * extent + 1e-12)
+
+
+@examples(60)
+@given(data=st.data())
+def test_two_borders_tell_the_horizon(data: st.DataObject) -> None:
+    """Exact scales at two rows leave one T; those of contradicting rows leave none."""
+    horizon, unit = data.draw(st.floats(-500, 500)), data.draw(spread(1e-3, 1e3))
+    row = np.array(data.draw(st.lists(st.integers(1, 2000), min_size=2, max_size=9, unique=True)), dtype=np.float64)[:, None] - horizon
+    scales = unit * (row + horizon)
+    least, most = horizon_bounds(row, scales, scales, np.array([[horizon - 0.4], [horizon + 0.4]]))
+    assert least[0] <= horizon <= most[0]
+    assert most[0] - least[0] <= 1e-6
+    falling = -np.sort(-scales, axis=0)
+    assert horizon_bounds(np.sort(row, axis=0), falling, falling, np.array([[horizon], [horizon + 0.4]]))[1][0] < horizon
 
 
 @examples(60)

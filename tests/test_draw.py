@@ -12,13 +12,16 @@ from numpy.typing import NDArray
 pytest.importorskip("cv2", reason="the extra 'recordings' is not installed")
 
 import cv2
+from turned_state import TurnedState
 
+from runtime.attitude import Attitude
 from runtime.camera import project
 from runtime.estimator import Box, Estimate, Outcome
 from runtime.explanation import Explanation, Reason, shortfall
 from runtime.image import runway_image
 from runtime.recordings import draw
-from runtime.scene import Camera, Marking, Runway, Scene
+from runtime.scene import Camera, Distortion, Marking, Runway, Scene
+from runtime.sensor_image import sensor_curves
 
 SCENE = Scene.load(Path(__file__).resolve().parents[1] / "models" / "paper.toml")
 TRUTH = np.array([0.63, 0.0, 0.93, 1.72])
@@ -93,6 +96,39 @@ def test_a_state_is_drawn_on_the_pixels_that_it_lights(scale):
     assert np.all(touched[lit != 0]) or scale == 1
     # A drawn line is one pixel of the picture wide and smoothed: it may touch the neighbours of a lit pixel, no more.
     assert not np.any(touched & (cv2.dilate(lit, np.ones((3, 3), np.uint8)) == 0))
+
+
+LENS = replace(
+    SCENE, camera=Camera(640, 480, focal_px=(533.0, 533.0), distortion=Distortion("radial-tangential", (-0.3, 0.1, 0.001, -0.001)))
+)
+
+
+@pytest.mark.parametrize("scene", [SCENE, LENS], ids=["pinhole", "lens"])
+def test_a_rolled_and_yawed_cameras_markings_are_drawn_where_it_shows_them(scene: Scene):
+    """Of the truth's image in rational numbers, and of the box: its turned corners, within a picture cut out about them."""
+    for a, b in ((0.15, -0.07), (-0.17, 0.17)):
+        state = TurnedState.near(TRUTH, a, b)
+        image = state.view(scene).image(state.seen).frame
+        roll, theta, yaw = (float(angle.mid()) for angle in state.angles)
+        attitude, truth = Attitude(roll, yaw), np.array([theta, *TRUTH[1:]])
+        ends = sensor_curves(scene, truth, attitude=attitude)[:, [0, -1]].reshape(-1, 2)
+        lit = np.argwhere(image)[:, ::-1]
+        assert all(np.abs(lit + 0.5 - end).max(axis=1).min() <= 0.51 for end in ends)
+        box = Box(np.subtract(truth, [0.02, 0, 0.03, 0.02]), np.add(truth, [0.015, 0, 0.02, 0.03]))
+        estimate = replace(estimate_of(box, image.astype(np.uint8)), state=truth)
+        panel = draw.draw_runway(scene, np.zeros_like(image), estimate, scale=4, attitude=attitude)[draw.LINE_HEIGHT :]
+        view = draw.runway_view(scene, estimate, None, 5, 4, attitude=attitude)
+        part = image[view.top : view.top + view.shape[0], view.left : view.left + view.shape[1]]
+        assert part.sum() == image.sum()
+        drawn = near_colour(panel, draw.STATE)[: 4 * view.shape[0], : 4 * view.shape[1]].reshape(view.shape[0], 4, view.shape[1], 4)
+        near = cv2.dilate(part.astype(np.uint8), np.ones((3, 3), np.uint8)) != 0
+        assert not (drawn.any(axis=(1, 3)) & ~near).any()
+        hulls = [cv2.convexHull(points.astype(np.float32)) for points in draw.box_outlines(scene, box, attitude)]
+        inside = [max(cv2.pointPolygonTest(hull, (float(u) + 0.5, float(v) + 0.5), True) for hull in hulls) for u, v in lit]
+        assert min(inside) > -1.0
+        picture = draw.draw_estimate(scene, image, estimate, truth=truth, attitude=attitude)
+        assert near_colour(picture, draw.TRUTH).any()
+        assert not with_colour(picture, draw.NO_RUNWAY)[:480].any()
 
 
 def test_the_outline_of_a_box_holds_its_states_and_is_reached_by_them():

@@ -18,7 +18,8 @@ from test_sensor_map import OFF, precise_sensor, seen_through, turns
 
 from runtime.camera import project
 from runtime.image import runway_image
-from runtime.painting import Painting, View, ideal_pixels_a_pixel, painted, what_pixels_show
+from runtime.outline import Outline
+from runtime.painting import Painted, Painting, View, ideal_pixels_a_pixel, what_pixels_show
 from runtime.scene import Calibration, Camera, Distortion, Scene, SceneError
 from runtime.sensor import Sensor
 from runtime.sensor_map import SensorMap
@@ -91,7 +92,7 @@ def test_no_pixel_of_the_runway_is_lost(
             met.append(point)
         else:
             assert not View.of(sensor).shown[int(point[1]), int(point[0])]
-    canvas = painted(frame, sensor)
+    canvas = Painted.of(frame, sensor, Outline.of(sensor)).ideal
     for u, v in points:
         assert canvas[int(v), int(u)], (u, v)
     if sensor.turn is None or turn is None:
@@ -127,7 +128,8 @@ def test_what_a_pixel_paints_is_what_meets_its_quadrilateral(name: str, turn: Tu
     assert still is not None
     sensor = still if turn is None else still.turned(turn)
     rows, columns = np.random.default_rng(8).integers(0, sensor.camera.shape, (60, 2)).T
-    table, everything = what_pixels_show(sensor, rows, columns)
+    shown = what_pixels_show(sensor, rows, columns)
+    table, everything = shown.table(sensor.ideal.height * sensor.ideal.width), shown.everything
     assert not everything.any()
     height, width = sensor.ideal.shape
     slack = 2 * (sensor.bow_px + 1e-5)

@@ -13,9 +13,10 @@ from scenes import BARELY_ABOVE, BARELY_BELOW, CUT_BELOW, CUT_LEFT, FREE_X, PAPE
 from build_model.partition import partition
 from build_model.spatial_filter import BELOW_HORIZON_PX, reference_row, sliced, spatial_filter, spatial_filters
 from build_model.window import Window
+from build_model.window_bank import cell_windows
 from runtime.camera import project, row_of_point
 from runtime.image import image_of_ends, lit_columns, runway_image
-from runtime.scene import Axis, Camera, Scene, SceneError
+from runtime.scene import Axis, Camera, Scene, SceneError, WindowedBank
 
 CASES = {"paper": PAPER, "three": THREE_MARKINGS, "cut left": CUT_LEFT, "cut below": CUT_BELOW, "free x": FREE_X}
 
@@ -134,3 +135,5 @@ def test_a_box_that_has_the_horizon_below_its_runway_is_refused() -> None:
     scene = replace(PAPER, domain=domain)
     with pytest.raises(SceneError, match=r"bank\.pitch_bins: too few for theta in \[0, 1\]"):
         spatial_filter(scene, scene.domain.lower, scene.domain.upper)
+    with pytest.raises(SceneError, match=r"domain\.theta_rad: too few cells for theta in \[0, 1\]"):
+        cell_windows(replace(scene, bank=WindowedBank()), scene.domain.lower, scene.domain.upper)

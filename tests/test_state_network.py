@@ -39,7 +39,8 @@ from build_model.state_network import (
 from build_model.window import Window
 from runtime.image import runway_image
 from runtime.model.format import OPSET
-from runtime.scene import Axis, Bank, Camera, Domain, EstimatorTraining, Marking, Runway, Scene
+from runtime.scene import Axis, Bank, Camera, Distortion, Domain, EstimatorTraining, Marking, Runway, Scene
+from runtime.sensor import Sensor
 
 Filter = Callable[[NDArray[np.uint8]], NDArray[np.uint8]]
 RandomStates = Callable[[Scene, int, int], NDArray[np.float64]]
@@ -87,6 +88,21 @@ def test_frames_without_clutter_are_the_exact_images(small_filter: Filter) -> No
     np.testing.assert_array_equal(frames.images(slice(None)).numpy(), images[:, *window.slices])
     assert images.sum() == frames.images(slice(None)).sum()
     assert ((frames.states >= SMALL.domain.lower) & (frames.states <= SMALL.domain.upper)).all()
+
+
+def test_behind_a_lens_frames_are_those_that_are_painted() -> None:
+    """Of the sensor's image of each state; clutter and missed pixels are the sensor's too."""
+    camera = replace(SMALL.camera, distortion=Distortion("radial-tangential", (-0.3, 0.1, 0.0, 0.0)))
+    sensor = Sensor.of(replace(SMALL, camera=camera))
+    window, ideal = domain_window(sensor.ideal), sensor.ideal
+    source = FrameSource(ideal, window, lambda frames: frames, sensor)
+    frames = source.draw(20, np.random.default_rng(0), clutter=0.0)
+    painted = np.stack([sensor.painted(image) for image in runway_image(sensor.scene, frames.states)])
+    np.testing.assert_array_equal(frames.images(slice(None)).numpy(), painted[:, *window.slices])
+    exact = runway_image(ideal, frames.states).sum()
+    assert painted.sum() > 1.5 * exact  # thicker than the ideal images
+    some, all_of = (source.draw(60, np.random.default_rng(1), clutter).images(slice(None)).mean() for clutter in (None, 0.0))
+    assert 0.8 * all_of < some < 4 * all_of
 
 
 def test_clutter_has_the_density_asked_for_and_the_filter_sees_whole_frames() -> None:

@@ -14,12 +14,14 @@ from rational_image import RationalState, RationalView
 from scenes import AIRPORT, CUT_LEFT, FREE_X, ONE_CELL, PAPER, STRIP
 from turned_state import TurnedState
 
-from build_model.export import export_model
+from build_model.export import NO_ESTIMATOR, export_model
 from runtime import Attitude, Box, Estimator, Motion, Outcome, Scene, Tracker
-from runtime.painting import painted
-from runtime.scene import AttitudeBounds
+from runtime.attitude import Turns
+from runtime.on_sensor import grouped
+from runtime.painting import Painted
+from runtime.scene import AttitudeBounds, Axis, Camera, Distortion
 from runtime.sensor import Sensor
-from runtime.turned import Bin, bins_of, grouped, joined, met_by_one, turned_map
+from runtime.turned import Bin, bins_of, joined, met_by_one, turned_map
 
 EstimatorOf = Callable[..., Estimator]
 SCALES = {"paper": PAPER, "strip": STRIP, "airport": AIRPORT}
@@ -58,6 +60,12 @@ def image(scene: Scene, state: TurnedState) -> np.ndarray:
     return state.view(scene).image(state.seen).frame.copy()
 
 
+def painted(scene: Scene, frame: np.ndarray, turns: Turns) -> np.ndarray:
+    """What is painted of a frame."""
+    sensor = Sensor.of(scene)
+    return Painted.of(frame, turned_map(sensor, turns), sensor.outline).ideal
+
+
 # --- painting ---
 
 
@@ -71,9 +79,9 @@ def test_no_pixel_of_the_runway_is_lost_in_painting(scene: Scene) -> None:
         c = float(state.seen.floats[0])
         turns = Bin(np.array([[c - 1e-12, c + 1e-12]]), np.array([attitude.roll]), np.array([attitude.yaw])).turns
         ideal = RationalView.of(scene.to_dict()).image(state.seen).frame
-        canvas = painted(image(scene, state), turned_map(Sensor.of(scene), turns)).view(bool)
+        canvas = painted(scene, image(scene, state), turns).view(bool)
         assert not (ideal & ~canvas).any(), number
-        unseen = painted(np.zeros(scene.camera.shape, dtype=bool), turned_map(Sensor.of(scene), turns)).view(bool)
+        unseen = painted(scene, np.zeros(scene.camera.shape, dtype=bool), turns).view(bool)
         if not plus_minus.any():
             assert (canvas & ~unseen).sum() <= 4 * ideal.sum() + 9
 
@@ -89,7 +97,7 @@ def test_a_missed_pixel_spoils_no_more_of_the_ideal_image_than_is_budgeted() -> 
         for dark in rng.choice(np.flatnonzero(seen), 3, replace=False):
             frame = seen.copy()
             frame.ravel()[dark] = False
-            assert (ideal & ~painted(frame, turned_map(Sensor.of(PAPER), turns)).view(bool)).sum() <= met_by_one(PAPER, turns) <= 9
+            assert (ideal & ~painted(PAPER, frame, turns).view(bool)).sum() <= met_by_one(PAPER, turns) <= 9
 
 
 def test_bins_cover_the_attitude() -> None:
@@ -109,7 +117,7 @@ def test_hulls_of_entries_hold_them(estimator_of: EstimatorOf) -> None:
     state = drawn(FREE_X, rng, 0.05)
     found = free.find(image(FREE_X, state), state.attitude(rng, 0.004, 0.004))
     assert found.turned is not None
-    entries = joined(*(sets for _, sets in found.turned.parts))
+    entries = joined(*found.turned.parts)
     few = grouped(entries, 20)
     assert len(few) < len(entries)
     for name in ("theta", "x", "y", "z", "roll", "yaw"):
@@ -137,6 +145,28 @@ def test_the_box_holds_the_state_at_every_scale(name: str, missed_budget: int, f
         assert estimate.certified, (number, state)
         assert estimate.box is not None
         assert state.within(estimate.box.lower, estimate.box.upper), (number, state)
+
+
+@pytest.mark.parametrize("lens", [None, Distortion("radial-tangential", (-0.3, 0.1, 0.0, 0.0))], ids=["pinhole", "barrel"])
+def test_filtered_is_the_sensors_and_keeps_the_runway(lens: Distortion | None, folder: Path) -> None:
+    """Every lit pixel of it, also where the turn brings it beyond the ideal frame; and little of the clutter where it does not."""
+    for name, u0 in (("whole", 320.0), ("cut", 45.5)):
+        camera = Camera(640, 480, focal_px=(533.0, 533.0), principal_point=(u0, 240.0), distortion=lens)
+        scene, path = replace(ONE_CELL, camera=camera), folder / f"filtered-{name}-{lens is None}.onnx"
+        scene = replace(scene, domain=replace(scene.domain, x_m=Axis((0.092,), 0.0)))  # no marking on a border of columns
+        export_model(scene, path, estimator=NO_ESTIMATOR)
+        model, rng = Estimator.load(path), np.random.default_rng(11)
+        for _ in range(3):
+            state = drawn(scene, rng)
+            runway = image(scene, state)
+            frame = runway | (rng.random(runway.shape) < 0.01)
+            filtered = model.estimate(frame, attitude=state.attitude(rng), refine=False).filtered.view(bool)
+            assert filtered.shape == frame.shape
+            assert not (filtered & ~frame).any()
+            assert not (runway & ~filtered).any()
+            if not model.sensor.runway_beyond:
+                assert (filtered & ~runway).sum() < 0.3 * (frame & ~runway).sum()
+        assert model.sensor.runway_beyond is (name == "cut")
 
 
 def test_a_known_attitude_costs_a_tenth(estimator_of: EstimatorOf) -> None:

@@ -333,6 +333,14 @@ def change_index(rng: Rng, model: Model, _cell: int) -> None:
     model.set_constant("runs_0", values)
 
 
+def point_beyond_the_sums(_rng: Rng, model: Model, _cell: int) -> None:
+    """From an unused place, which counts nothing."""
+    values = numpy_helper.to_array(model.constants["runs_0"]).copy()
+    runs = values.reshape(2, -1)
+    runs[:, np.flatnonzero(runs[0] == runs[1])[-1]] = 10**8
+    model.set_constant("runs_0", values)
+
+
 def change_place(rng: Rng, model: Model, cell: int) -> None:
     """An entry is given another one's mask."""
     name = str(rng.choice(["must_light_place", "may_light_place"]))
@@ -442,6 +450,7 @@ STRUCTURAL = {
     change_assumptions: "assumptions",
     change_default_budget: "budget",
     change_index: r"not count a run|counted twice|S as painted|must_light_size|not in O|pixel of K|outside S",
+    point_beyond_the_sums: "onnxruntime cannot run it",
     change_place: "must_light_size|not in O|pixel of K",
     change_painted_run: "S as painted|spatial_run",
     change_small_constant: "graph",
@@ -543,6 +552,16 @@ def test_boxes_that_the_refinement_cannot_rely_on_are_refuted(model: Model) -> N
     upper[-1, 0, 3] = np.nextafter(upper[..., 3].max(), np.float32(np.inf))
     with pytest.raises(Refuted, match="reaches out of the domain; cell 1; entry 0"):
         check_boxes(SCENE, replace(tables, state_upper=upper))
+
+
+def test_padding_that_reaches_into_the_hulls_is_refuted(model_in_rows: Model) -> None:
+    tables = model_in_rows.tables()
+    place = tuple(np.argwhere(tables.must_light_size == PADDING_SIZE)[0])
+    for value, claim in ((np.finfo(np.float32).max, "out of the hulls' way"), (np.nan, "state_upper is not finite")):
+        upper = tables.state_upper.copy()
+        upper[place] = value
+        with pytest.raises(Refuted, match=claim):
+            check_boxes(SCENE, replace(tables, state_upper=upper))
 
 
 def test_saving_without_a_mutation_changes_nothing(model: Model, tmp_path: Path) -> None:

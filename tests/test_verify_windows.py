@@ -30,7 +30,7 @@ SMALL = replace(
     bank=WindowedBank(set_px=24.0, rows=8, places=2),
 )
 TOLERANT = replace(SMALL, calibration=Calibration(principal_px=0.5), tolerance=Tolerance(line_px=1, missed_budget=1))
-PROVED = {"small": SMALL, "tolerant": TOLERANT, "strip": WINDOWED["strip in windows"]}
+PROVED = {"small": SMALL, "tolerant": TOLERANT, "strip": WINDOWED["strip in windows"], "from the left": WINDOWED["final, from the left"]}
 
 
 @pytest.fixture(scope="module")
@@ -178,6 +178,23 @@ def give_a_group_to_another_cell(_rng: Rng, model: Model) -> None:
     model.set_tables(replace(tables, row_cell=row_cell))
 
 
+def point_beyond_the_sums(_rng: Rng, model: Model) -> None:
+    """From an unused place: a frame that opens the group could not be looked at."""
+    tables = model.tables()
+    start, stop = tables.windows.gate_start.copy(), tables.windows.gate_stop.copy()
+    place = tuple(np.argwhere(start == stop)[-1])
+    start[place] = stop[place] = 10**8
+    with_windows(model, lambda table: replace(table, gate_start=start, gate_stop=stop))
+
+
+def reach_to_infinity(_rng: Rng, model: Model) -> None:
+    """An entry that goes on beyond its cell holds no more states; but the loader takes no such number."""
+    tables = model.tables()
+    lower = tables.line_lower.copy()
+    lower[..., 0] = np.where(lower[..., 0] <= SMALL.domain.lower[0], -np.inf, lower[..., 0])
+    model.set_tables(replace(tables, line_lower=lower))
+
+
 def misstate_the_least(_rng: Rng, model: Model) -> None:
     model.metadata["smallest_must_light"] += 1
 
@@ -216,6 +233,8 @@ MUTATIONS = {
     narrow_a_state_box: "box of states",
     give_a_group_two_reference_rows: "reference rows|do not cover|does not cross",
     give_a_group_to_another_cell: "reaches out of its cell",
+    point_beyond_the_sums: "unused place lies outside the sums",
+    reach_to_infinity: "line_lower is not finite",
     misstate_the_least: "smallest_must_light",
     open_fewer_places: "graph: the constant 'places'",
     keep_the_larger_of_nothing: "node",

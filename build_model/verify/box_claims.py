@@ -17,6 +17,9 @@ from runtime.model.format import PADDING_SIZE
 from runtime.model.limits import BELOW_HORIZON_PX, ROWS_BELOW_FRAME, largest_steps
 from runtime.scene import Scene
 
+FARTHEST_PADDING = 2.0**64
+"""The largest number in a box of states where there is no entry: the largest float32 moves it out of the way of every hull."""
+
 
 def check_boxes(scene: Scene, tables: BankTables) -> None:
     """Boxes of states, scales and reference rows are such as the loader demands. Raises `Refuted` with the first that is not."""
@@ -55,6 +58,10 @@ def _check_numbers(scene: Scene, tables: BankTables) -> None:
         ("an entry's reference_row is not near the frame", (row >= 0) & (row <= scene.camera.height + ROWS_BELOW_FRAME)),
     ):
         demand_of_all(padding | holds, claim, tables)
+    for name in ("state_lower", "state_upper", "line_lower", "line_upper", "reference_row"):
+        demand_of_all(np.isfinite(getattr(tables, name)).reshape(*padding.shape, -1).all(axis=2), f"{name} is not finite", tables)
+    near = (np.maximum(np.abs(lower), np.abs(upper)) <= FARTHEST_PADDING).all(axis=2)
+    demand_of_all(~padding | near, "a box of states in the padding does not stay out of the hulls' way", tables)
 
 
 def _check_entry(scene: Scene, camera: BallCamera, tables: BankTables, row: int, place: int) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import onnxruntime
@@ -10,22 +11,22 @@ from numpy.typing import NDArray
 
 from build_model.filter_tables import BankTables, FilterTables, WindowTables
 from build_model.verify.cell_claim import BankClaim, CellClaim, cell_claims
-from build_model.verify.counterexample import demand
+from build_model.verify.counterexample import Counterexample, Refuted, demand
 from build_model.verify.window_claim import WindowClaim, window_claims
+from build_model.window import Window
+from runtime.errors import one_line
 from runtime.model.format import BUDGETS, FRAME, OVERFLOW, PADDING_SIZE
 from runtime.scene import Scene, WindowedBank
 
 SAMPLE_FRAMES = 6
 """Frames on which the graph's outputs are compared with their definition."""
+LOG_FATAL_ONLY = 4
 SAMPLE_DENSITIES = (0.0, 0.02, 0.2, 0.6, 1.0)
 
 
 def check_outputs(content: bytes, scene: Scene, tables: BankTables) -> None:
     """Runs the file in onnxruntime on sample frames, and compares NN_F's outputs with their definition. Raises `Refuted`."""
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    options.log_severity_level = 3  # it warns of the budgets, initialisers that are inputs too
-    session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    session = _opened(content)
     rng = np.random.default_rng(0)
     defined = _definition(scene, tables)
     for number in range(SAMPLE_FRAMES):
@@ -33,10 +34,27 @@ def check_outputs(content: bytes, scene: Scene, tables: BankTables) -> None:
         missed, extra = (int(budget) for budget in rng.integers([0, -1], [tables.smallest_must_light, 64]))
         expected = defined(frame, missed, extra)
         budgets = {name: np.array(budget, dtype=np.int32) for name, budget in zip(BUDGETS, (missed, extra), strict=True)}
-        found = session.run(list(expected), {FRAME: frame, **budgets})
+        found = _run(session, list(expected), {FRAME: frame, **budgets})
         for name, value in zip(expected, map(np.asarray, found), strict=True):
             same = np.array_equal(value, np.where(np.isnan(expected[name]), value, expected[name]))
             demand(same, f"graph: on sample frame {number} the output {name!r} is not what the masks define")
+
+
+def _opened(content: bytes) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.log_severity_level = LOG_FATAL_ONLY  # it warns of the budgets, and an error becomes a refutation
+    try:
+        return onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+    except Exception as error:  # onnxruntime raises classes of its own that share only this one
+        raise Refuted(Counterexample(f"graph: onnxruntime cannot load it ({one_line(error):.160})")) from error
+
+
+def _run(session: onnxruntime.InferenceSession, outputs: list[str], feed: dict[str, NDArray[Any]]) -> Sequence[Any]:
+    try:
+        return session.run(outputs, feed)
+    except Exception as error:  # as above
+        raise Refuted(Counterexample(f"graph: onnxruntime cannot run it ({one_line(error):.160})")) from error
 
 
 def _definition(scene: Scene, tables: BankTables) -> Callable[[NDArray[np.uint8], int, int], dict[str, NDArray]]:
@@ -65,10 +83,13 @@ def defined_outputs(
 
 
 def defined_by_windows(claims: list[WindowClaim], frame: NDArray[np.uint8], missed_budget: int) -> dict[str, NDArray]:
-    """`defined_outputs` of a bank of windows: the first `places` groups that pass their gates are opened, and group 0 if they are fewer."""
+    """`defined_outputs` of a bank of windows: the first `places` groups that pass their gates are opened, and group 0 if they are fewer.
+
+    What lies outside the window of all S counts as dark, for no state of the domain lights it, nor has a witness there.
+    """
     bank, window = claims[0].scene.bank, claims[0].window
     assert isinstance(bank, WindowedBank)
-    witnessed = np.pad(_witnessed(claims[0], frame), 1)
+    witnessed = np.pad(_within(window, _witnessed(claims[0], _within(window, frame))), 1)
     gates = np.concatenate([_dark(claim.gate.windows(window, claim.cell, "gate"), witnessed) for claim in claims])
     passing = np.flatnonzero(gates <= missed_budget)
     opened = set(passing[: bank.places].tolist()) | ({0} if len(passing) < min(bank.places, len(gates)) else set())
@@ -97,6 +118,13 @@ def _dark(windows: tuple[NDArray[np.int64], ...], padded: NDArray[np.bool_]) -> 
         border, first, last = (int(part[number, place]) for part in windows)
         counts[number] += not both[border - 1, first : last + 1].any()
     return counts
+
+
+def _within(window: Window, frame: NDArray[Any]) -> NDArray[Any]:
+    """The frame, dark outside the window."""
+    seen = np.zeros_like(frame)
+    seen[window.slices] = frame[window.slices]
+    return seen
 
 
 def _witnessed(claim: BankClaim, frame: NDArray[np.uint8]) -> NDArray[np.bool_]:

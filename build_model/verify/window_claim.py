@@ -25,7 +25,7 @@ class WindowPlaces:
     def windows(self, window: Window, cell: int, name: str) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """Border, first and last column of each, (sets, windows) each; an unused one has last < first.
 
-        Raises `Refuted` unless each look-up counts pixels of one row of the window.
+        Raises `Refuted` unless each look-up counts pixels of one row of the window, and those of unused ones find a sum too.
         """
         rows, columns = window.shape
         used = self.start != self.stop
@@ -33,6 +33,8 @@ class WindowPlaces:
         inside = (self.start >= 0) & (first <= last) & (last < columns) & (self.stop % rows == row)
         wrong = (used & ~inside).any(axis=1)
         demand(not wrong.any(), f"{name}: an index does not count pixels of one row of the window", cell, int(wrong.argmax()))
+        beyond = ((self.start < 0) | (self.start >= rows * (columns + 1))).any(axis=1)
+        demand(not beyond.any(), f"{name}: an index of an unused place lies outside the sums", cell, int(beyond.argmax()))
         return np.where(used, row + window.top + 1, 0), np.where(used, first + window.left, 1), np.where(used, last + window.left, 0)
 
 

@@ -180,7 +180,7 @@ def _estimate_all(
         estimate = report.estimator.estimate(frame, refine=refine, attitude=attitude)
         milliseconds = 1000 * (time.perf_counter() - begun)
         tracked = None if follower is None else follower.update(frame, start_us + report.instant_us)
-        report.add(start_us, frame, estimate, milliseconds, tracked, level=attitude is None and report.estimator.attitude is None)
+        report.add(start_us, frame, estimate, milliseconds, tracked, attitude or report.estimator.attitude)
         if bar is not None and task is not None:
             seconds += stream.step_us / 1e6
             bar.update(task, advance=1, seconds=seconds)

@@ -25,11 +25,12 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from runtime.attitude import Attitude
 from runtime.estimate import Box, Estimate
 from runtime.explanation import Explanation, dark_pixels
 from runtime.image import runway_image
 from runtime.scene import STATE_NAMES, STATE_UNITS, Scene
-from runtime.sensor_image import sensor_curves
+from runtime.sensor_image import DRAWN_POINTS, sensor_curves
 
 Picture = NDArray[np.uint8]
 Colour = tuple[int, int, int]
@@ -90,25 +91,28 @@ def draw_estimate(
     title: str = "",
     zoom: int = 5,
     width: int | None = None,
+    attitude: Attitude | None = None,
 ) -> Picture:
     """The whole frame, beside it the runway at most `zoom` times larger, and below them the outcome in numbers with a legend.
 
     `frame`: (height, width), lit where not 0. `mask`: S of `estimate.cell`, bool (height, width). `truth`: a state (4,). `explanation`:
     of an estimate without a box. Returns (height', `width`, 3); by default twice the frame's width, magnified until the text fits.
+    `attitude`: of a rolled and yawed camera, as whose middle everything is drawn; its dark pixels are not.
     """
     scale = -(-NARROWEST_PICTURE // frame.shape[1]) if width is None else width / 2 / frame.shape[1]
     whole = View(0, 0, frame.shape, scale)
-    close = runway_view(scene, estimate, truth, zoom, scale * zoom, explanation)
-    dark = _dark(scene, frame, truth, explanation)
+    close = runway_view(scene, estimate, truth, zoom, scale * zoom, explanation, attitude)
+    dark = _dark(scene, frame, truth, explanation) if attitude is None else None
     panels = [_magnified(_pixels(frame, estimate.filtered, mask, dark), view) for view in (whole, close)]
     _outline(panels[0], whole, close)
-    _draw_states(panels[1], scene, close, estimate, truth, explanation)
+    _draw_states(panels[1], scene, close, estimate, truth, explanation, attitude)
     height, half = whole.size
     beside = _canvas(height, 2 * half)
     for panel, left in zip(panels, (0, half), strict=True):
         beside[: panel.shape[0], left : left + panel.shape[1]] = panel
     beside[:, half] = FRAME_BORDER
-    return np.concatenate([beside, _text_strip(scene, estimate, truth, explanation, title, mask is not None, beside.shape[1])])
+    shown = mask is not None, dark is not None
+    return np.concatenate([beside, _text_strip(scene, estimate, truth, explanation, title, shown, beside.shape[1])])
 
 
 def draw_runway(
@@ -121,11 +125,12 @@ def draw_runway(
     title: str = "",
     zoom: int = 5,
     scale: int = 3,
+    attitude: Attitude | None = None,
 ) -> Picture:
     """Only the runway's surroundings, as large as 1/`zoom` of the frame a side magnified `scale` times, with one line of text."""
-    view = runway_view(scene, estimate, truth, zoom, scale)
+    view = runway_view(scene, estimate, truth, zoom, scale, attitude=attitude)
     panel = _magnified(_pixels(frame, estimate.filtered, mask, None), view)
-    _draw_states(panel, scene, view, estimate, truth, None)
+    _draw_states(panel, scene, view, estimate, truth, None, attitude)
     height, width = (max(side // zoom, 1) * scale for side in frame.shape)
     picture = _canvas(LINE_HEIGHT + height, width)
     picture[LINE_HEIGHT : LINE_HEIGHT + panel.shape[0], : panel.shape[1]] = panel
@@ -152,7 +157,13 @@ def contact_sheet(pictures: Sequence[Picture], columns: int = 4, gap: int = 8) -
 
 
 def runway_view(
-    scene: Scene, estimate: Estimate, truth: ArrayLike | None, zoom: int, scale: float, explanation: Explanation | None = None
+    scene: Scene,
+    estimate: Estimate,
+    truth: ArrayLike | None,
+    zoom: int,
+    scale: float,
+    explanation: Explanation | None = None,
+    attitude: Attitude | None = None,
 ) -> View:
     """The part of the frame, within it, around all markings of estimate and truth; else of the nearest state, else of NN_e's.
 
@@ -162,7 +173,7 @@ def runway_view(
     known = [np.asarray(state) for state in (estimate.state, truth) if state is not None]
     known = known or [estimate.network_state if nearest is None else nearest]
     frame = np.array(scene.camera.shape)
-    low, high = _extent(scene, np.stack(known))
+    low, high = _extent(scene, np.stack(known), attitude)
     part = next((part for part in range(zoom, 1, -1) if (frame // part >= ROOM * (high - low)).all()), 1)
     size = np.maximum(frame // part, 1)
     start = np.clip(np.round((low + high) / 2 - size / 2), 0, frame - size).astype(int)
@@ -170,39 +181,48 @@ def runway_view(
     return View(int(start[0]), int(start[1]), (int(size[0]), int(size[1])), fitting)
 
 
-def _extent(scene: Scene, states: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _extent(scene: Scene, states: NDArray[np.float64], attitude: Attitude | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """First and last (row, column) of the frame that the states' runways light; where they light none, the place nearest to them."""
     states = states[np.isfinite(states).all(axis=1)]
-    lit = np.argwhere(runway_image(scene, states).any(axis=0))
+    lit = np.argwhere(runway_image(scene, states).any(axis=0)) if attitude is None else _points_in_view(scene, states, attitude)
     if len(lit) == 0:
-        curves = sensor_curves(scene, states)
+        curves = sensor_curves(scene, states, attitude=attitude)
         centre = np.nan_to_num(curves).mean(axis=(0, 1, 2))[::-1] if len(states) else np.zeros(2)
         nearest = np.clip(centre, 0, scene.camera.shape)
         return nearest, nearest
     return lit.min(axis=0), lit.max(axis=0) + 1.0
 
 
-def box_outlines(scene: Scene, box: Box) -> NDArray[np.float64]:
+def _points_in_view(scene: Scene, states: NDArray[np.float64], attitude: Attitude) -> NDArray[np.float64]:
+    """(row, column) of points along the markings as a turned camera shows them, those in the frame: (n, 2)."""
+    curves = sensor_curves(scene, states, attitude=attitude)
+    if scene.camera.pinhole:  # the two ends of straight lines
+        curves = curves[..., :1, :] + (curves[..., 1:, :] - curves[..., :1, :]) * np.linspace(0, 1, 2 * DRAWN_POINTS)[:, None]
+    points = curves.reshape(-1, 2)[:, ::-1]
+    return np.floor(points[((points >= 0) & (points < scene.camera.shape)).all(axis=1)])
+
+
+def box_outlines(scene: Scene, box: Box, attitude: Attitude | None = None) -> NDArray[np.float64]:
     """Every marking's ends, or points of its curve, at `SAMPLES` states an axis of the box, corners included: (markings, points, 2) px.
 
-    Every sampled marking lies in the convex hull of its row.
+    Every sampled marking lies in the convex hull of its row. Of a turned camera, what the attitude's middle shows.
     """
     sides = zip(box.lower, box.upper, strict=True)
     axes = [np.unique(np.linspace(low, high, SAMPLES)) for low, high in sides]
     states = np.array(list(itertools.product(*axes)))
-    outlines = np.moveaxis(sensor_curves(scene, states, BOX_POINTS), 1, 0).reshape(len(scene.runway.markings), -1, 2)
+    outlines = np.moveaxis(sensor_curves(scene, states, BOX_POINTS, attitude), 1, 0).reshape(len(scene.runway.markings), -1, 2)
     return outlines[:, np.isfinite(outlines).all(axis=(0, 2))]
 
 
-def _seen(scene: Scene, state: ArrayLike) -> NDArray[np.float64]:
+def _seen(scene: Scene, state: ArrayLike, attitude: Attitude | None) -> NDArray[np.float64]:
     """The curves of the markings that the camera shows something of, (markings, points, 2) px."""
-    curves = sensor_curves(scene, state)
+    curves = sensor_curves(scene, state, attitude=attitude)
     return curves[np.isfinite(curves).all(axis=(1, 2))]
 
 
-def _ends(scene: Scene, state: ArrayLike) -> NDArray[np.float64]:
+def _ends(scene: Scene, state: ArrayLike, attitude: Attitude | None) -> NDArray[np.float64]:
     """Near and far end of each of those, (markings, 2, 2) px."""
-    return _seen(scene, state)[:, [0, -1]]
+    return _seen(scene, state, attitude)[:, [0, -1]]
 
 
 def colour_pixels(frame: NDArray, filtered: NDArray, mask: NDArray[np.bool_] | None) -> Picture:
@@ -255,28 +275,41 @@ def _outline(panel: Picture, whole: View, part: View) -> None:
 
 
 def _draw_states(
-    panel: Picture, scene: Scene, view: View, estimate: Estimate, truth: ArrayLike | None, explanation: Explanation | None
+    panel: Picture,
+    scene: Scene,
+    view: View,
+    estimate: Estimate,
+    truth: ArrayLike | None,
+    explanation: Explanation | None,
+    attitude: Attitude | None,
 ) -> None:
     """The box as a translucent band, then the markings of the nearest state, of the truth and of the estimate."""
     if estimate.box is not None:
-        hulls = [cv2.convexHull(view.points(points)) for points in box_outlines(scene, estimate.box)]
+        hulls = [cv2.convexHull(view.points(points)) for points in box_outlines(scene, estimate.box, attitude) if len(points)]
         filled = np.zeros_like(panel)
         for hull in hulls:
             cv2.fillPoly(filled, [hull], BOX, cv2.LINE_AA, FRACTION_BITS)
         panel[:] = cv2.addWeighted(filled, BOX_LIGHT, panel, 1, 0)
         cv2.polylines(panel, hulls, True, BOX, 1, cv2.LINE_AA, FRACTION_BITS)
     if truth is not None:
-        for u, v in view.points(_ends(scene, truth)).reshape(-1, 2).tolist():
+        for u, v in view.points(_ends(scene, truth, attitude)).reshape(-1, 2).tolist():
             cv2.circle(panel, (u, v), END_RADIUS << FRACTION_BITS, TRUTH, 1, cv2.LINE_AA, FRACTION_BITS)
     nearest = None if explanation is None else explanation.nearest.state
     for state, colour in ((nearest, NEAREST), (truth, TRUTH), (estimate.state, STATE)):
         if state is not None:
-            cv2.polylines(panel, list(view.points(_seen(scene, state))), False, colour, 1, cv2.LINE_AA, FRACTION_BITS)
+            cv2.polylines(panel, list(view.points(_seen(scene, state, attitude))), False, colour, 1, cv2.LINE_AA, FRACTION_BITS)
 
 
 def _text_strip(
-    scene: Scene, estimate: Estimate, truth: ArrayLike | None, explanation: Explanation | None, title: str, has_mask: bool, width: int
+    scene: Scene,
+    estimate: Estimate,
+    truth: ArrayLike | None,
+    explanation: Explanation | None,
+    title: str,
+    shown: tuple[bool, bool],
+    width: int,
 ) -> Picture:
+    """Lines of text; `shown`: whether a mask and the runway's dark pixels are."""
     size = min(1.0, width / (2 * NARROWEST_PICTURE))
     strip = _canvas(TEXT_LINES * int(LINE_HEIGHT * size), width)
     fallback = "estimate: box centre, as NN_e's state lies outside" if estimate.used_fallback else ""
@@ -291,8 +324,8 @@ def _text_strip(
         lines[2] = [("estimate", STATE), *((text, TEXT) for text in _numbers(estimate.state))]
     if truth is not None:
         lines[3] = [("truth", TRUTH), *((text, TEXT) for text in _numbers(np.asarray(truth)))]
-    dark = "" if truth is None and explanation is None else "runway, dark"
-    lines.append([("lit", FRAME), ("filtered", FILTERED), (f"S of cell {estimate.cell}" if has_mask else "", MASK_TEXT), (dark, NO_RUNWAY)])
+    mask, dark = (text if shows else "" for text, shows in zip((f"S of cell {estimate.cell}", "runway, dark"), shown, strict=True))
+    lines.append([("lit", FRAME), ("filtered", FILTERED), (mask, MASK_TEXT), (dark, NO_RUNWAY)])
     for line, parts in enumerate(lines):
         _write(strip, line, parts, size)
     return strip

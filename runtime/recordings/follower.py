@@ -58,9 +58,6 @@ class Follower:
         scene = estimator.scene
         readings = None if references.attitude is None else AttitudeReadings.load(references.attitude)
         turned = readings is not None and not references.pitch_alone and not _level(estimator, readings)
-        if turned and not scene.calibration.exact:
-            found = f"{references.attitude} tells a roll or yaw, the scene a plus-minus in [calibration]"
-            raise TrackingError(f"--attitude: {found}; give --pitch-alone")
         level = not turned and scene.attitude is None and scene.camera.mount in (None, Mount())
         if references.gyroscope is not None and not level:
             raise TrackingError(

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.attitude import Attitude
 from runtime.estimate import Estimate
 from runtime.estimator import Estimator
 from runtime.explanation import Explanation, explain
@@ -109,12 +110,13 @@ class Report:
         estimate: Estimate,
         milliseconds: float,
         tracked: Estimate | None = None,
-        level: bool = True,
+        attitude: Attitude | None = None,
     ) -> None:
         """One window: its start, its frame, what the estimator made of it, how long that took, and what a tracker made of it.
 
-        Of a camera that is not `level` no truth tells which pixels should be lit: windows are not judged or explained then.
+        Of a camera that an `attitude` is told of no truth tells which pixels should be lit: windows are not judged or explained then.
         """
+        level = attitude is None
         number = self.tally.counts["windows"]
         instant_us = start_us + self.instant_us
         earliest, latest = self._instants_us or (instant_us, instant_us)  # of all runs of a clock that went back, too
@@ -133,7 +135,8 @@ class Report:
             self._rows.writerow(row)
         box, followed = estimate.box, tracked and tracked.box
         self._history.add(Moment(start_us, start_us + self.step_us, estimate.state, box and box.lower, box and box.upper, state, followed))
-        self._draw(number, frame, estimate, {"truth": state, "explanation": explanation, "title": f"{start_us / 1e6:.3f} s"})
+        shown = {"truth": state, "explanation": explanation, "title": f"{start_us / 1e6:.3f} s", "attitude": attitude}
+        self._draw(number, frame, estimate, shown)
 
     def _tracked_row(self, instant_us: float, tracked: Estimate | None, truth: NDArray[np.float64] | None) -> list[object]:
         if tracked is None:
@@ -156,7 +159,8 @@ class Report:
             self._to_draw = {kept: picture for kept, picture in self._to_draw.items() if kept % self._picture_every == 0}
 
     def _picture(self, frame: NDArray[np.uint8], estimate: Estimate, **shown: Any) -> Picture:
-        return draw_estimate(self.estimator.scene, frame, estimate, mask=self.estimator.spatial_mask(estimate.cell), **shown)
+        mask = self.estimator.spatial_mask(estimate.cell, shown["attitude"])
+        return draw_estimate(self.estimator.scene, frame, estimate, mask=mask, **shown)
 
     def close(self, extra: dict[str, Any]) -> dict[str, Any]:
         """Finishes every file; `extra` goes into summary.json, which is returned."""

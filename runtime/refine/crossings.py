@@ -20,7 +20,7 @@ def offsets_at_crossings(_: StateSet, sight: Sight) -> Interval:
     borders, missed = sight.borders, sight.missed
     first, last = sight.halves.first, sight.halves.last
     if missed.budget == 0:
-        bounds = borders.offsets(sight.scene, _at_borders(first, np.maximum), _at_borders(last, np.minimum))
+        bounds = borders.offsets(sight.scene, at_borders(first, np.maximum), at_borders(last, np.minimum))
         low, high = _where(borders.crossed, *bounds)
         return np.maximum.reduce(low, axis=1), np.minimum.reduce(high, axis=1)
     usable = sight.crossed & ~missed.halves
@@ -38,7 +38,7 @@ def _where(usable: Bits, low: Floats, high: Floats) -> Interval:
     return np.minimum(low, none, out=low), np.maximum(high, np.negative(none, out=none), out=high)
 
 
-def _at_borders(halves: Floats, closer: np.ufunc) -> Floats:
+def at_borders(halves: Floats, closer: np.ufunc) -> Floats:
     """The closer of what is shown above and below each border, (markings, rows + 1, sets); at the outermost ones there is one row alone."""
     upper, lower = halves
     both = np.empty((len(upper), upper.shape[1] + 1, upper.shape[2]))

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from runtime.refine.interval import Floats, Interval
+from runtime.refine.lit_columns import flat_rows
+from runtime.refine.sensor_borders import SensorBorders
+from runtime.refine.sensor_end_pixels import sheared_at_ends
 from runtime.refine.sight import Sight
 from runtime.state_set import StateSet, scale_ratio, tangent_of_row
 
@@ -18,13 +20,17 @@ def offsets_at_ends(sets: StateSet, sight: Sight) -> Interval:
     """
     borders, u0 = sight.borders, sight.scene.camera.u0
     complete = sight.missed.left == 0
-    if sets.roll is not None or not complete.any():
+    if isinstance(borders, SensorBorders) and complete.any():
+        seen = sheared_at_ends(borders, sight)
+        if seen is not None:
+            return np.maximum.reduce(seen[0], axis=1), np.minimum.reduce(seen[1], axis=1)
+    if isinstance(borders, SensorBorders) or not complete.any():
         return np.full(borders.near[0].shape, -np.inf), np.full(borders.near[0].shape, np.inf)
     row = np.floor(np.array([borders.far[1], borders.near[0]]))  # (ends, markings, sets), as all that follows
     slow, fast = _ratios(sets, sight, row)
     place = row - borders.row[0]
     inside = np.minimum(np.maximum(place, 0), len(borders.row) - 2)
-    at = _flat(inside, len(borders.row) - 1)
+    at = flat_rows(inside, len(borders.row) - 1)
     dark = sight.rows.dark.take(at)
     known = (borders.near[0] > borders.far[1]) & (place == inside) & (slow > 0) & ~sight.missed.rows.take(at) & complete
     slow, fast = np.where(known, slow, 1.0), np.where(known, fast, 1.0)
@@ -41,10 +47,3 @@ def _ratios(sets: StateSet, sight: Sight, row: Floats) -> Interval:
     start, stop = (np.maximum(row[0], borders.far[0]), borders.near[0]), (borders.far[1], np.minimum(row[1] + 1, borders.near[1]))
     low, high = scale_ratio(sets, tangent_of_row(sight.scene.camera, np.array([start, stop])))
     return low[0], high[1]
-
-
-def _flat(row: Floats, rows: int) -> NDArray[np.int64]:
-    """Where the rows (ends, markings, sets) of each marking and set stand in arrays (markings, rows, sets), flat."""
-    _, markings, sets = row.shape
-    first = np.arange(0, markings * rows * sets, rows * sets)[:, None] + np.arange(sets)
-    return row.astype(np.int64) * sets + first

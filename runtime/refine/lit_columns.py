@@ -50,3 +50,10 @@ def at_both_borders(side: NDArray[Any]) -> NDArray[Any]:
     both = np.empty((2, len(side), side.shape[1] - 1, side.shape[2]), dtype=side.dtype)
     both[0], both[1] = side[:, :-1], side[:, 1:]
     return both
+
+
+def flat_rows(row: Floats, rows: int) -> NDArray[np.int64]:
+    """Where the rows (ends, markings, sets) of each marking and set stand in arrays (markings, rows, sets), flat."""
+    _, markings, sets = row.shape
+    first = np.arange(0, markings * rows * sets, rows * sets)[:, None] + np.arange(sets)
+    return row.astype(np.int64) * sets + first

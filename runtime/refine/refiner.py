@@ -6,9 +6,9 @@ what the frame shows. A state whose markings cross the border r of two rows ligh
     u(r) = u0 + (p_x - x) scale R(theta, r)  lies in the closed columns of a lit pixel above r, and of one below r
 
 up to the missed pixels. In a thin slice R is all but a number, and every border bounds each marking's offset (p_x - x) scale on both
-sides; so does, if none may be missed, the lit pixel of an end. Beyond the rows that all states of the slice cross, the first
-row without a usable lit pixel ends a marking, and so bounds its distance. Slices that contradict the frame are dropped; the others are cut
-finer, in the end only those that carry a face of the box.
+sides; so does, if none may be missed, the lit pixel of an end, and two borders bound theta (`border_pairs`). Beyond the rows that all
+states of the slice cross, the first row without a usable lit pixel ends a marking, and so bounds its distance. Slices that contradict the
+frame are dropped; the others are cut finer, in the end only those that carry a face of the box.
 
 Under Theorem B the lit pixels of S (here: vouched pixels) are the runway's, but for `extra_budget` of them. A vouched pixel that only one
 marking of the slice could light bounds that marking's offset by the pixel's other side, and pulls its ends out to the pixel's row.
@@ -30,16 +30,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from runtime.refine.altitude import contract_by_altitude
+from runtime.refine.border_pairs import contract_by_border_pairs
 from runtime.refine.ends import contract_by_ends
 from runtime.refine.interval import Bits, Floats
 from runtime.refine.lit_pixels import LitPixels
 from runtime.refine.offsets import contract_by_offsets
+from runtime.refine.optics import Optics
 from runtime.refine.sight import Sight, Vouched
 from runtime.refine.vouched import contract_by_vouched
 from runtime.scene import Scene
 from runtime.state_set import StateSet
 
-CONTRACTORS: tuple[Callable[[StateSet, Sight], StateSet], ...] = (contract_by_offsets, contract_by_vouched, contract_by_ends)
+CONTRACTORS: tuple[Callable[[StateSet, Sight], StateSet], ...] = (
+    contract_by_offsets,
+    contract_by_vouched,
+    contract_by_border_pairs,
+    contract_by_ends,
+)
 """Each gives subsets of the sets that hold all their states which the frame allows; in the order in which one helps the next."""
 
 
@@ -48,31 +55,41 @@ class Search:
     """How the entries are cut: all of them at first, then in rounds the pieces that carry a face of the box around what is left."""
 
     first: int
-    """Slices of theta that every entry is cut into, at most."""
-    theta: int
-    z: int
-    scale: int
-    """Parts that a piece which carries a face is cut into along each interval."""
+    """Sets that the entries are cut into along theta, about."""
+    sets: int
+    """Sets of a round, about: what is not cut otherwise is cut along theta, in two or more."""
     pieces: int
     """How many pieces a face, at most."""
     rounds: int
     gain: float
     """At most so many rounds, and until one takes less than this share from every side of the box."""
+    finest: int = 16
+    """A set is cut into no more parts along theta at once."""
+    z: int = 1
+    scale: int = 1
     roll: int = 1
     yaw: int = 1
-    """As `theta`, where these are known up to a plus-minus alone."""
+    """Parts that a piece which carries a face is cut into along each interval."""
     patience: int = 1
     """So many rounds in a row must take less than the share."""
+
+    def others(self, number: int) -> dict[str, int]:
+        """Parts along all intervals but theta's in the round of this number: along scale and z in turns, scale first."""
+        parts = {name: getattr(self, name) for name in ("z", "scale", "roll", "yaw")}
+        return parts | {"scale" if number % 2 else "z": 1}
 
 
 FACES = 6
 """Of the box in theta, y and z that is searched."""
-NONE_MISSED = Search(first=4, theta=4, z=2, scale=1, pieces=2, rounds=8, gain=0.02)
-SOME_MISSED = Search(first=4, theta=3, z=2, scale=2, pieces=4, rounds=20, gain=0.02)
+NONE_MISSED = Search(first=48, sets=64, pieces=8, rounds=6, gain=0.05, z=2)
+SOME_MISSED = Search(first=48, sets=144, pieces=6, rounds=20, gain=0.03, z=2, scale=2)
 """Missed pixels are counted where windows are a pixel or two wide (`missed`): then smaller pieces pay, cut along the scale too."""
-NARROWED = Search(first=4, theta=3, z=2, scale=2, pieces=4, rounds=20, gain=0.002)
-"""Pixels may be missed, and the entries were cut to a prior: they are few, so that there is time for small gains."""
-TURNED = Search(first=2, theta=2, z=1, scale=1, pieces=16, rounds=80, gain=0.002, roll=2, yaw=2, patience=3)
+NARROWED = Search(first=48, sets=144, pieces=4, rounds=20, gain=0.01, z=2, scale=2, patience=2)
+"""Pixels may be missed, and the entries were cut to a prior: they are few, so that there is time for small gains, and for a round without
+one, after which the pieces that carry the faces are small enough for the next one to tell more."""
+TURNED = Search(first=512, sets=512, pieces=2, rounds=8, gain=0.02, finest=4, z=2)
+"""Pairs of borders tell nothing on a turned sensor: theta is cut, round by round."""
+SWAYING = Search(first=512, sets=512, pieces=16, rounds=80, gain=0.002, finest=2, roll=2, yaw=2, patience=3)
 """Roll and yaw are known up to a plus-minus alone: half of it then tells more than half of a slice, and many pieces carry one face."""
 LEAST_SWAY_PX = 0.25
 """A plus-minus that moves no point of the frame by this much is not cut."""
@@ -93,6 +110,8 @@ class Refiner:
     extra_budget: int
     window: tuple[slice, slice] = (slice(None), slice(None))
     """Rows and columns outside of which pixels count as lit, whatever the frame shows there."""
+    optics: Optics | None = None
+    """Of the lens, where the frame is that of the sensor behind it; `scene` is the sensor's then."""
 
     def refine(self, frame: Bits, entries: StateSet, vouched_pixels: Bits | None = None, narrowed: bool = False) -> StateSet:
         """Slices that hold all states of `entries` which are consistent with `frame`, (height, width); none if there is none.
@@ -104,19 +123,22 @@ class Refiner:
             return entries
         witnesses = LitPixels.of(frame, self.window, beyond=True)
         vouched = None if vouched_pixels is None else Vouched(LitPixels.of(vouched_pixels, self.window, beyond=False), self.extra_budget)
-        search = NONE_MISSED if self.missed_budget == 0 else NARROWED if narrowed else SOME_MISSED
-        if entries.roll is not None and entries.yaw is not None:
+        flat = self.optics is None and entries.roll is None
+        level = NONE_MISSED if flat else TURNED
+        search = level if self.missed_budget == 0 else NARROWED if narrowed else SOME_MISSED
+        if not flat:
             entries = self._contracted(witnesses, vouched, entries)  # most contradict the frame as they are
-            search = self._with_turns(search, entries)
-        most_sets = LARGEST_ROUND // (len(self.scene.runway.markings) * witnesses.rows)
-        slices = min(max(most_sets // max(len(entries), 1), 1), search.first)
-        finer_cuts = {name: getattr(search, name) for name in ("theta", "z", "scale", "roll", "yaw")}
-        a_face = min(max(most_sets // (FACES * math.prod(finer_cuts.values())), 1), search.pieces)
+            search = self._with_turns(search, entries) if entries.roll is not None else search
+        most_sets = max(LARGEST_ROUND // (len(self.scene.runway.markings) * witnesses.rows), 1)
+        a_face = min(max(most_sets // (FACES * 2 * max(math.prod(search.others(number).values()) for number in (0, 1))), 1), search.pieces)
+        slices = _parts(min(search.first, most_sets), len(entries), 1, search.finest)
         pieces = self._contracted(witnesses, vouched, _cut(entries, theta=slices, roll=search.roll, yaw=search.yaw))
         extent, idle = _extent(pieces), 0
-        for _ in range(search.rounds if len(pieces) else 0):
+        for number in range(search.rounds if len(pieces) else 0):
             outer = _carries_a_face(pieces, a_face)
-            finer = self._contracted(witnesses, vouched, _cut(pieces[outer], **finer_cuts))
+            others = search.others(number)
+            slices = _parts(min(search.sets, most_sets), int(outer.sum()) * math.prod(others.values()), 2, search.finest)
+            finer = self._contracted(witnesses, vouched, _cut(pieces[outer], theta=slices, **others))
             pieces, before = joined(finer, pieces[~outer]), extent
             extent = _extent(pieces)
             idle = idle + 1 if (extent > (1 - search.gain) * before).all() else 0
@@ -129,11 +151,11 @@ class Refiner:
         camera = self.scene.camera
         reach = {"roll": math.hypot(camera.width, camera.height) / 2, "yaw": max(camera.focal_u_px, camera.focal_v_px)}
         widths = {name: float(np.ptp(getattr(entries, name), axis=1).max(initial=0.0)) * px for name, px in reach.items()}
-        cuts = {name: getattr(TURNED, name) for name, width_px in widths.items() if width_px >= LEAST_SWAY_PX}
+        cuts = {name: getattr(SWAYING, name) for name, width_px in widths.items() if width_px >= LEAST_SWAY_PX}
         if not cuts:
             return search
-        finer = (search.z, search.scale) if self.missed_budget > 0 else (TURNED.z, TURNED.scale)
-        return replace(TURNED, z=finer[0], scale=finer[1], **{"roll": 1, "yaw": 1, **cuts})
+        finer = replace(SWAYING, z=search.z, scale=search.scale) if self.missed_budget > 0 else SWAYING
+        return replace(finer, **{"roll": 1, "yaw": 1, **cuts})
 
     def _contracted(self, witnesses: LitPixels, vouched: Vouched | None, sets: StateSet) -> StateSet:
         """The sets without most of the states that the frame contradicts, and without empty sets."""
@@ -146,7 +168,7 @@ class Refiner:
         if len(sets) == 0:
             return sets
         sets = contract_by_altitude(self.scene.camera, sets)
-        sight = Sight.of(self.scene, sets, witnesses, self.missed_budget, vouched)
+        sight = Sight.of(self.scene, sets, witnesses, self.missed_budget, vouched, self.optics)
         if self.missed_budget > 0:  # then most sets miss too many pixels, and each costs more
             left = np.flatnonzero(sight.missed.left >= 0)
             sets, sight = sets[left], sight.of_sets(left)
@@ -157,6 +179,11 @@ class Refiner:
         sets = contract_by_altitude(self.scene.camera, sets)
         empty = sets.empty
         return sets[~empty] if empty.any() else sets
+
+
+def _parts(wanted: int, sets: int, least: int, finest: int) -> int:
+    """Parts that each of so many sets is cut into, from `least` to `finest`, so that there are as many as wanted in all, about."""
+    return min(max(wanted // max(sets, 1), least), finest)
 
 
 def _cut(sets: StateSet, **parts: int) -> StateSet:

@@ -28,20 +28,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from runtime.attitude import Turns
 from runtime.refine.borders import across, ends_in_rows
+from runtime.refine.curves import Curves, Met, shown_rows
 from runtime.refine.interval import Bits, Floats, Interval
 from runtime.refine.lit_pixels import LitPixels
+from runtime.refine.optics import Optics, Stretch
+from runtime.refine.unknowns import Moves, Unknowns
+from runtime.refine.view import LEAST_DEPTH, ROUNDED_SWAY, Lines, Sway, View
 from runtime.rounding import ROUNDING_SHARE, above, below, column_margin_px, lowered, raised
 from runtime.scene import Camera, Scene
 from runtime.state_set import StateSet, scale_ratio, tangent_of_row
 
-LEAST_DEPTH = 0.1
-"""Of a ray of length about 1, or of a marking's line against a row: below it, where a marking is seen counts as not known at all."""
+SHARE_OF_DISC = 0.9
+"""Of the radius of a lens's disc: beyond it markings are cut off."""
+ROWS_BEYOND = 2.0
+"""Rows beyond their ends within which the lines of markings are followed: so rows in which one may end are seen as a whole."""
 ROUNDED_TERMS = 16.0
 """Factor on the terms of a column's margin: what `LEAST_DEPTH` lets a rounding grow to, and more."""
-ROUNDED_SWAY = 1 + 2.0**-30
-"""Factor on bounds of how far an offset may sway, which are sums of products of sizes: far above their rounding."""
 
 
 @dataclass(frozen=True)
@@ -66,13 +69,26 @@ class SensorBorders:
     point: Sway
     """How the offset of p* sways, (1, 1, sets)."""
 
+    met: Met | None = None
+    """Behind a lens, or of a camera that may be off: where in rays the markings may meet the borders."""
+    unknowns: Unknowns | None = None
+    """There: what may be off, where something may."""
+
     @staticmethod
-    def of(scene: Scene, sets: StateSet, pixels: LitPixels) -> SensorBorders:
-        """The borders between the farthest and the nearest ends; one row on either side stands for all rows out of the window."""
-        view, offset = View.of(scene.camera, sets), _offset_range(scene, sets)
+    def of(scene: Scene, sets: StateSet, pixels: LitPixels, optics: Optics | None = None) -> SensorBorders:
+        """The borders between the farthest and the nearest ends; one row on either side stands for all rows out of the window.
+
+        `scene` has the sensor's camera, whose lens is in `optics`.
+        """
+        view, offset = View.of(scene.camera, sets, optics), _offset_range(scene, sets)
         margin_px = _column_margins_px(scene, sets, offset, pixels)
         ideal_near, ideal_far = ends_in_rows(scene, sets)
-        near, far = (_on_sensor(scene.camera, sets, view, offset, rows, margin_px) for rows in (ideal_near, ideal_far))
+        lines, curves, unknowns = Lines.of(scene.camera, view, offset), None, None
+        if optics is None:
+            near, far = (_rays_of_ends(scene.camera, sets, view, offset, rows, margin_px).rows for rows in (ideal_near, ideal_far))
+        else:
+            near, far, curves, points = _ends_behind_lens(scene, sets, view, offset, (ideal_near, ideal_far), margin_px, lines)
+            unknowns = None if optics.known(view.turns) else Unknowns.of(view, optics, points)
         first, last = (
             np.minimum(np.maximum(np.floor(row), pixels.top), pixels.bottom)
             for row in (np.minimum.reduce([*far[0], *near[0]], axis=0), np.maximum.reduce([*near[1], *far[1]], axis=0))
@@ -80,9 +96,15 @@ class SensorBorders:
         row = first + np.arange(int(np.maximum.reduce(last - first)) + 2, dtype=np.float64)[:, None]
         crossed = row > far[1][:, None]
         crossed &= row < near[0][:, None]
-        columns = _columns(scene.camera, view, offset, row, margin_px)
+        tangent = tangent_of_row(scene.camera, row)
+        met = None if curves is None else curves.met(tangent)
+        if met is None or optics is None:
+            columns = _as_columns(scene.camera, *lines.at(tangent), margin_px)
+        else:
+            beside_px = optics.beside_px(np.maximum(np.abs(met.shown[0]), np.abs(met.shown[1])), scene.camera.focal_u_px)
+            columns = _as_columns(scene.camera, met.shown, met.known, margin_px + beside_px + optics.calibration.principal_px)
         point = view.sway(*_middle_point(scene.camera, sets, view, offset, ideal_near, ideal_far), np.zeros(1))
-        return SensorBorders(row, near, far, ideal_near, ideal_far, crossed, columns, margin_px, view, point)
+        return SensorBorders(row, near, far, ideal_near, ideal_far, crossed, columns, margin_px, view, point, met, unknowns)
 
     def offsets(self, scene: Scene, first: Floats, last: Floats, rows: slice = slice(None)) -> Interval:
         """Bounds on (p_x - x'') scale of markings that cross the borders `rows` in the closed columns `first` to `last`; of that shape.
@@ -91,6 +113,8 @@ class SensorBorders:
         those of the columns' ends; elsewhere, and where the ray may not fall, there is no bound.
         """
         camera, view = scene.camera, self.view
+        if view.optics is not None:
+            return self._offsets_behind_lens(view.optics, first, last, self.row[rows])
         tangent_v = tangent_of_row(camera, self.row[rows])
         seen = np.isfinite(first) & np.isfinite(last)
         left = np.where(seen, first - camera.u0, 0.0) / camera.focal_u_px
@@ -100,9 +124,32 @@ class SensorBorders:
         sway = view.sway((left + right) / 2, tangent_v[None], np.abs(right - left) / 2).beside(self.point, camera, view)
         low = view.quotient(left, tangent_v, -margin, np.minimum) * camera.focal_u_px - sway
         high = view.quotient(right, tangent_v, margin, np.maximum) * camera.focal_u_px + sway
-        bound = seen & rises & np.isfinite(low) & np.isfinite(high)
-        dark = first > last
-        return np.where(dark, np.inf, np.where(bound, low, -np.inf)), np.where(dark, -np.inf, np.where(bound, high, np.inf))
+        return _bounds_where(seen & rises, first > last, low, high)
+
+    def _offsets_behind_lens(self, optics: Optics, first: Floats, last: Floats, row: Floats) -> Interval:
+        """`offsets` by the rays of the corners of pixels, of a camera that is known exactly."""
+        stretch = optics.between(first, last + 1, row)
+        low, high = self._quotients(optics, stretch)
+        return _bounds_where(stretch.known & self.view.rises_along(optics, stretch), first > last, low, high)
+
+    def sheared_offsets(self, first: Floats, last: Floats, rows: slice = slice(None)) -> tuple[Floats, Floats, Floats]:
+        """Bounds on (p_x - x'') scale'' - kappa w of such markings, and w, where something is unknown of the camera (`unknowns`)."""
+        view, unknowns, row = self.view, self.unknowns, self.row[rows]
+        optics = view.optics
+        assert optics is not None
+        assert unknowns is not None
+        stretch = optics.between(first, last + 1, row)
+        w, rest, known = unknowns.sheared_at(view, Moves.at(view, optics, *stretch.middle, stretch.reach))
+        low, high = self._quotients(optics, stretch)
+        known &= stretch.known & view.rises_along(optics, stretch)
+        return *_bounds_where(known, first > last, low - rest, high + rest), w
+
+    def _quotients(self, optics: Optics, stretch: Stretch) -> Interval:
+        """The smallest and the largest F s X/D at the ends of stretches."""
+        focal = optics.camera.focal_u_px
+        margin = self.margin_px / focal + stretch.off
+        low = self.view.quotient(*stretch.left, -margin, np.minimum, stretch.off) * focal
+        return low, self.view.quotient(*stretch.right, margin, np.maximum, stretch.off) * focal
 
     def seen_x(self, sets: StateSet) -> Interval:
         """Range of x'', to which offsets refer, (sets,), m."""
@@ -136,13 +183,24 @@ class SensorBorders:
         place = np.where(usable, row - self.row[0], 0).astype(np.int64)
         usable = usable & (place >= 0) & (place < len(self.row))
         place = np.where(usable, place, 0)
-        first, last = (np.take_along_axis(side, place[:, None], axis=1)[:, 0] for side in self.columns)
-        usable &= np.isfinite(first) & np.isfinite(last)
-        left = np.where(usable, first - camera.u0, 0.0) / camera.focal_u_px
-        right = np.where(usable, last + (1 - camera.u0), 0.0) / camera.focal_u_px
-        tangent = tangent_of_row(camera, np.where(usable, row, 0.0))
-        (low, high), in_front = self.view.ideal_tangents(left, right, tangent)
-        usable &= in_front
+
+        def at(side: Floats) -> Floats:
+            return np.take_along_axis(side, place[:, None], axis=1)[:, 0]
+
+        if self.met is None:
+            first, last = (at(side) for side in self.columns)
+            usable &= np.isfinite(first) & np.isfinite(last)
+            left = np.where(usable, first - camera.u0, 0.0) / camera.focal_u_px
+            right = np.where(usable, last + (1 - camera.u0), 0.0) / camera.focal_u_px
+            tangents: tuple[Floats, ...] = (tangent_of_row(camera, np.where(usable, row, 0.0)),)
+        else:
+            usable &= at(self.met.known) & np.isfinite(self.near[1]) & np.isfinite(self.far[0])
+            margin = self.margin_px / camera.focal_u_px
+            left, right = at(self.met.s[0]) - margin, at(self.met.s[1]) + margin
+            tangents = at(self.met.t[0]) - margin, at(self.met.t[1]) + margin
+        ranges = [self.view.ideal_tangents(left, right, tangent) for tangent in tangents]  # a quotient of sums: extremes are at corners
+        usable &= np.logical_and.reduce([in_front for _, in_front in ranges])
+        low, high = np.minimum.reduce([side[0] for side, _ in ranges]), np.maximum.reduce([side[1] for side, _ in ranges])
         low, high = (np.where(usable, camera.v0 + camera.focal_v_px * side, 0.0) for side in (low, high))
         terms = abs(camera.v0) + np.abs(low) + np.abs(high)
         return np.where(usable, below(lowered(low, terms)), -np.inf), np.where(usable, above(raised(high, terms)), np.inf)
@@ -151,144 +209,6 @@ class SensorBorders:
         """First and last column that each marking may light in each row, (markings, rows, sets): its line is straight."""
         low, high = self.columns
         return np.minimum(low[:, :-1], low[:, 1:]), np.maximum(high[:, :-1], high[:, 1:])
-
-
-@dataclass(frozen=True)
-class Sway:
-    """h_a and h_b over F s, at points: middles of their ranges, and how far these reach to either side."""
-
-    by_a: Floats
-    off_by_a: Floats
-    by_b: Floats
-    off_by_b: Floats
-    known: Bits
-    """False where D may be 0: the others mean nothing there."""
-
-    def beside(self, point: Sway, camera: Camera, view: View) -> Floats:
-        """Largest |E(p) - E(p*)|, px; infinite where it is not known."""
-        by_a = np.abs(self.by_a - point.by_a) + self.off_by_a + point.off_by_a
-        by_b = np.abs(self.by_b - point.by_b) + self.off_by_b + point.off_by_b
-        terms = ROUNDING_SHARE * (np.abs(self.by_a) + np.abs(point.by_a) + np.abs(self.by_b) + np.abs(point.by_b))
-        largest = view.total(by_a + terms, by_b + terms) * (camera.focal_u_px * ROUNDED_SWAY)
-        return np.where(self.known & point.known, largest, np.inf)
-
-    def alone(self, view: View) -> Floats:
-        """Largest |E(p)| over F; infinite where it is not known."""
-        return np.where(self.known, view.total(np.abs(self.by_a) + self.off_by_a, np.abs(self.by_b) + self.off_by_b), np.inf)
-
-
-@dataclass(frozen=True)
-class View:
-    """The rotations of sets of states and what is needed of their pitch, (sets,) each, or (2, sets) at both ends of the pitch."""
-
-    turns: Turns
-    cosine: Floats
-    sine: Floats
-    fall: Floats
-    """s(c, t_ref)."""
-    condition: Floats
-    focal: Floats
-    """F, as an array (sets,)."""
-
-    @staticmethod
-    def of(camera: Camera, sets: StateSet) -> View:
-        """Of sets with roll and yaw."""
-        cosine, sine = (part.T.copy() for part in sets.turn)
-        fall = sets.reference_fall.T.copy()
-        return View(sets.turns, cosine, sine, fall, sets.condition, np.full(len(sets), camera.focal_u_px))
-
-    def rays(self, tangent_u: Floats, tangent_v: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-        """X, Y, Z of points of the sensor in the ideal frame, by the rotation in the middle; and S'."""
-        turns = self.turns
-        aside = turns.cos_a * tangent_u + turns.sin_a * tangent_v
-        down = turns.cos_a * tangent_v - turns.sin_a * tangent_u
-        return turns.cos_b * aside - turns.sin_b, down, turns.sin_b * aside + turns.cos_b, aside
-
-    def quotient(self, tangent_u: Floats, tangent_v: Floats, margin: Floats, extreme: np.ufunc) -> Floats:
-        """The smallest or largest (X + margin) s/D over the set's pitches; the worst infinity where D may not be above 0."""
-        across_, down, ahead, _ = self.rays(tangent_u, tangent_v)
-        across_ = across_ + margin
-        bounds = []
-        for cosine, sine, fall in zip(self.cosine, self.sine, self.fall, strict=True):
-            falls = cosine * down + sine * ahead
-            terms = ROUNDING_SHARE * (np.abs(down) + np.abs(ahead))
-            for side in (falls - terms, falls + terms):
-                bounds.append(np.where(falls > terms, across_ / np.where(falls > terms, side, 1.0), -np.inf) * fall)
-        worst = np.minimum.reduce(bounds) if extreme is np.minimum else np.maximum.reduce(bounds)
-        known = np.logical_and.reduce([np.isfinite(bound) for bound in bounds])
-        rounded = ROUNDING_SHARE * self.condition * np.abs(np.where(known, worst, 0.0))
-        nothing = -np.inf if extreme is np.minimum else np.inf
-        return np.where(known, worst - rounded if extreme is np.minimum else worst + rounded, nothing)
-
-    def rises(self, tangent_v: Floats) -> Bits:
-        """True where g_3 T > g_2 in all states: an offset grows along a border of the sensor, (rows, sets)."""
-        turns = self.turns
-        forward = turns.cos_b * tangent_v - turns.sin_a * turns.sin_b
-        least = np.minimum(*(cosine * forward + sine * turns.cos_a for cosine, sine in zip(self.cosine, self.sine, strict=True)))
-        # concave in c up to straight down, or else its ends are not enough: a hair's breadth is what the middle can lie lower
-        return least - (1 + np.abs(tangent_v)) * (turns.off + self.bulge + ROUNDING_SHARE) > 0
-
-    @property
-    def bulge(self) -> Floats:
-        """How far cos(c) Y + sin(c) Z can leave the range of its values at both ends of c, as a share of the ray's length, (sets,)."""
-        width = np.abs(self.sine[1] - self.sine[0]) + np.abs(self.cosine[1] - self.cosine[0])
-        return width * width
-
-    def sway(self, tangent_u: Floats, tangent_v: Floats, reach: Floats) -> Sway:
-        """How offsets sway with a and b at points up to `reach` beside the given ones along the border; arrays (markings, rows, sets)."""
-        turns = self.turns
-        x, y, z, aside = self.rays(tangent_u, tangent_v)
-        length = 1 + np.abs(tangent_u) + np.abs(tangent_v) + reach
-        off = (turns.off + ROUNDING_SHARE) * length + reach
-        cosine, sine = (self.cosine[0] + self.cosine[1]) / 2, (self.sine[0] + self.sine[1]) / 2
-        off_cosine, off_sine = (
-            np.abs(self.cosine[1] - self.cosine[0]) / 2 + self.bulge,
-            np.abs(self.sine[1] - self.sine[0]) / 2 + self.bulge,
-        )
-        falls = cosine * y + sine * z
-        off_falls = off_cosine * np.abs(y) + off_sine * np.abs(z) + off
-        known = falls > 2 * off_falls
-        falls, off_falls = np.where(known, falls, 1.0), np.where(known, off_falls, 0.0)
-        per = 1 / falls
-        off_per = off_falls * per / (falls - off_falls)
-        ratio, off_ratio = x * per, np.abs(x) * off_per + off * (per + off_per)
-        size = np.abs(ratio) + off_ratio
-        steep = np.abs(sine) + off_sine
-        by_b = -(z * per + sine * ratio * ratio)
-        off_by_b = np.abs(z) * off_per + off * (per + off_per) + steep * off_ratio * (np.abs(ratio) + size) + off_sine * size * size
-        leaning = sine * turns.sin_b
-        off_leaning = steep * turns.off_b + off_sine
-        inner = cosine * aside - leaning * y
-        off_inner = (cosine + off_cosine + np.abs(leaning) + off_leaning) * off + off_cosine * np.abs(aside) + off_leaning * np.abs(y)
-        whole = turns.cos_b * y + ratio * inner
-        off_whole = off * (1 + turns.off_b) + turns.off_b * np.abs(y) + size * off_inner + off_ratio * np.abs(inner)
-        by_a = whole * per
-        off_by_a = np.abs(whole) * off_per + off_whole * (per + off_per)
-        return Sway(by_a, off_by_a, by_b, off_by_b, known)
-
-    def total(self, by_a: Floats, by_b: Floats) -> Floats:
-        """off_a by_a + off_b by_b times the largest s, as both are over F s."""
-        largest = np.maximum(self.fall[0], self.fall[1]) + self.bulge * (1 + np.abs(self.condition * self.fall.min(axis=0)))
-        return (self.turns.off_a * by_a + self.turns.off_b * by_b) * largest
-
-    def ideal_tangents(self, left: Floats, right: Floats, tangent_v: Floats) -> tuple[Interval, Bits]:
-        """Range of Y/Z over the points between two on a border of the sensor; True where they lie in front, and below the horizon."""
-        turns, lows, highs, fine = self.turns, [], [], np.ones(left.shape, dtype=bool)
-        for tangent_u in (left, right):
-            x, y, z, aside = self.rays(tangent_u, tangent_v)
-            off = (turns.off + ROUNDING_SHARE) * (1 + np.abs(tangent_u) + np.abs(tangent_v))
-            falls = np.minimum(*(cosine * y + sine * z for cosine, sine in zip(self.cosine, self.sine, strict=True)))
-            ahead = z - off
-            fine &= (ahead > LEAST_DEPTH) & (falls > off + self.bulge * (1 + np.abs(tangent_u) + np.abs(tangent_v)))
-            ahead = np.where(ahead > LEAST_DEPTH, ahead, 1.0)
-            steep = (np.abs(y) + off) / ahead
-            by_a = (np.abs(aside) + off) / ahead + steep * (np.abs(turns.sin_b) + turns.off_b) * (np.abs(y) + off) / ahead
-            by_b = steep * (np.abs(x) + off) / ahead
-            sway = (turns.off_a * by_a + turns.off_b * by_b) * ROUNDED_SWAY + ROUNDING_SHARE * (1 + steep)
-            tangent = y / np.where(ahead > LEAST_DEPTH, z, 1.0)
-            lows.append(tangent - sway)
-            highs.append(tangent + sway)
-        return (np.minimum(*lows), np.maximum(*highs)), fine
 
 
 def _offset_range(scene: Scene, sets: StateSet) -> Interval:
@@ -308,10 +228,21 @@ def _column_margins_px(scene: Scene, sets: StateSet, offset: Interval, pixels: L
     return column_margin_px(ROUNDED_TERMS * sets.condition * steep * (largest + max(sides) + camera.focal_u_px))
 
 
-def _on_sensor(camera: Camera, sets: StateSet, view: View, offset: Interval, rows: Interval, margin_px: Floats) -> Interval:
-    """Rows on the sensor, (markings, sets), px, of ends in these rows of the ideal frame; without bounds where one may not be in front.
+@dataclass(frozen=True)
+class EndRays:
+    """Ranges of the rays of ends on the sensor, (markings, sets); without bounds where one may not be in front."""
 
-    T = (sin(a) X + cos(a) Y)/Z is a quotient of sums in u and in v: its extremes are at corners. dT/da = S, dT/db = sin(a) + T X/Z.
+    s: Interval
+    t: Interval
+    rows: Interval
+    """Those of a pinhole's frame, px."""
+
+
+def _rays_of_ends(camera: Camera, sets: StateSet, view: View, offset: Interval, rows: Interval, margin_px: Floats) -> EndRays:
+    """Where the sensor sees ends in these rows of the ideal frame.
+
+    T = (sin(a) X + cos(a) Y)/Z and S = (cos(a) X - sin(a) Y)/Z are quotients of sums in u and in v: their extremes are at corners.
+    dT/da = S, dT/db = sin(a) + T X/Z; dS/da = -T, dS/db = cos(a) + S X/Z.
     """
     turns = view.turns
     down = tuple(tangent_of_row(camera, side) for side in rows)
@@ -331,64 +262,80 @@ def _on_sensor(camera: Camera, sets: StateSet, view: View, offset: Interval, row
     nearest, ahead = np.where(seen, nearest, 1.0), [np.where(seen, side, 1.0) for side in ahead]
     corners = [(turns.sin_a * x + turns.cos_a * y) / z for x, z in zip(across_, ahead, strict=True) for y in down]
     beside = [turns.cos_a * x - turns.sin_a * y for x in across_ for y in down]
-    low, high = np.minimum.reduce(corners), np.maximum.reduce(corners)
-    by_a = (np.maximum.reduce(np.abs(beside)) + off) / nearest
-    falls = np.maximum(np.abs(low), np.abs(high)) * np.maximum(*ahead) / nearest + off / nearest
-    by_b = np.abs(turns.sin_a) + turns.off_a + falls * (np.maximum(*np.abs(across_)) + off) / nearest
-    sway = (turns.off_a * by_a + turns.off_b * by_b) * ROUNDED_SWAY + ROUNDING_SHARE * length / nearest
-    low, high = camera.v0 + camera.focal_v_px * (low - sway), camera.v0 + camera.focal_v_px * (high + sway)
+    far_aside, leaning = (np.maximum.reduce(np.abs(beside)) + off) / nearest, (np.maximum(*np.abs(across_)) + off) / nearest
+
+    def swayed(corners: list[Floats], by_a: Floats, turned: Floats) -> Interval:
+        low, high = np.minimum.reduce(corners), np.maximum.reduce(corners)
+        size = np.maximum(np.abs(low), np.abs(high)) * np.maximum(*ahead) / nearest + off / nearest
+        by_b = np.abs(turned) + turns.off_a + size * leaning
+        sway = (turns.off_a * by_a + turns.off_b * by_b) * ROUNDED_SWAY + ROUNDING_SHARE * length / nearest
+        return low - sway, high + sway
+
+    t = swayed(corners, far_aside, turns.sin_a)
+    low, high = (camera.v0 + camera.focal_v_px * side for side in t)
     terms = abs(camera.v0) + np.abs(low) + np.abs(high)
-    return np.where(seen, below(lowered(low, terms)), -np.inf), np.where(seen, above(raised(high, terms)), np.inf)
+    rows = np.where(seen, below(lowered(low, terms)), -np.inf), np.where(seen, above(raised(high, terms)), np.inf)
+    if view.optics is None:
+        return EndRays(t, t, rows)
+    far_down = (np.maximum.reduce(np.abs([turns.sin_a * x + turns.cos_a * y for x in across_ for y in down])) + off) / nearest
+    s = swayed([(turns.cos_a * x - turns.sin_a * y) / z for x, z in zip(across_, ahead, strict=True) for y in down], far_down, turns.cos_a)
+    s, t = ((np.where(seen, side[0], -np.inf), np.where(seen, side[1], np.inf)) for side in (s, t))
+    return EndRays(s, t, rows)
 
 
-def _columns(camera: Camera, view: View, offset: Interval, row: Floats, margin_px: Floats) -> Interval:
-    """First and last column in which a marking's line may meet each border of the sensor, (markings, rows, sets).
+def _ends_behind_lens(
+    scene: Scene, sets: StateSet, view: View, offset: Interval, ends: tuple[Interval, Interval], margin_px: Floats, lines: Lines
+) -> tuple[Interval, Interval, Curves, tuple[Floats, Floats]]:
+    """Ranges of the sensor's rows of near and far ends, the curves between them, and about the rays of four ends, (4, sets) each.
 
-    A marking is n.p = 0 with n = k f - e, k = offset/(F s): S = (k (f_2 T + f_3) - (e_2 T + e_3))/(e_1 - k f_1).
+    There are no bounds where the curves may not be met once only.
+
+    What lies beyond the lens's disc is cut off. An end that may lie there has no bound beyond, and as its other bound that of a point of
+    the marking which lies within.
     """
-    turns, tangent = view.turns, tangent_of_row(camera, row)
-    low, high = (side[:, None] / camera.focal_u_px for side in offset)
-    shares = [
-        (
-            (cosine * (turns.cos_a * tangent) + sine * (turns.sin_a * turns.sin_b * tangent + turns.cos_b)) / fall,
-            (sine * (turns.cos_a * turns.sin_b) - cosine * turns.sin_a) / fall,
-        )
-        for cosine, sine, fall in zip(view.cosine, view.sine, view.fall, strict=True)
-    ]
-    along, steep = ((np.minimum(*sides), np.maximum(*sides)) for sides in zip(*shares, strict=True))
-    level = turns.sin_a * turns.cos_b * tangent - turns.sin_b
-    top = tuple(side - level for side in _product((low, high), along))
-    bottom = tuple(turns.cos_a * turns.cos_b - side for side in reversed(_product((low, high), steep)))
-    moves, slants = _line_sways(view, low, high)
-    moved = moves[1] * np.abs(tangent) + moves[2]
-    top, bottom = (top[0] - moved, top[1] + moved), (bottom[0] - moves[0], bottom[1] + moves[0])
-    known = (bottom[0] > LEAST_DEPTH) & slants
-    sides = [one / np.where(known, other, 1.0) for one in top for other in bottom]
-    low, high = np.minimum.reduce(sides), np.maximum.reduce(sides)
+    optics, camera = view.optics, scene.camera
+    assert optics is not None
+    (near_low, near_high), (far_low, far_high) = ends
+    top, bottom = _rows_within_disc(camera, sets, optics, offset)
+    rows = np.stack([np.minimum(near_low, bottom), near_high, far_low, np.maximum(far_high, top)])
+    inside = (rows >= top) & (rows <= bottom)
+    rows = np.where(np.isfinite(rows), np.clip(rows, top, bottom), np.nan)
+    rays = _rays_of_ends(camera, sets, view, offset, (rows, rows), margin_px)
+    (low, high), known = shown_rows(optics, view.turns, rays.s, rays.t)
+    beyond = ROWS_BEYOND / camera.focal_v_px
+    curves = Curves.of(optics, lines, rays.t[0][2] - beyond, rays.t[1][1] + beyond, margin_px / camera.focal_u_px)
+    beside_px = optics.beside_px(np.maximum(np.abs(low), np.abs(high)), camera.focal_v_px)
+    low, high = camera.v0 + camera.focal_v_px * low - beside_px, camera.v0 + camera.focal_v_px * high + beside_px
+    terms = abs(camera.v0) + np.abs(low) + np.abs(high)
+    low, high = below(lowered(low, terms)), above(raised(high, terms))
+    known &= curves.monotone
+    outer, usable = (scene.runway.x_m.argmin(), scene.runway.x_m.argmax()), np.isfinite(rays.s[0]) & np.isfinite(rays.t[0])
+    rays_at = [(np.where(usable, low, 0.0) + np.where(usable, high, 0.0)) / 2 for low, high in (rays.s, rays.t)]
+    s, t = (np.stack([side[place, marking] for marking in outer for place in (3, 0)]) for side in rays_at)
+    return (
+        (np.where(known[0], low[0], -np.inf), np.where(known[1] & inside[1], high[1], np.inf)),
+        (np.where(known[2] & inside[2], low[2], -np.inf), np.where(known[3], high[3], np.inf)),
+        curves,
+        (s, t),
+    )
+
+
+def _rows_within_disc(camera: Camera, sets: StateSet, optics: Optics, offset: Interval) -> Interval:
+    """Ideal rows between which the markings lie within the lens's disc, about; NaN where they do nowhere: (markings, sets) each, px."""
+    (slope, start), (other_slope, other_start) = sets.ratio_lines
+    side = np.mean(offset, axis=0) / camera.focal_u_px / 2
+    a, b = side * (slope + other_slope), side * (start + other_start)
+    within = (1 + a * a) * (SHARE_OF_DISC * optics.lens.radius) ** 2 - b * b
+    root = np.sqrt(np.where(within > 0, within, np.nan))
+    return tuple(camera.v0 + camera.focal_v_px * ((sign * root - a * b) / (1 + a * a)) for sign in (-1, 1))  # pyright: ignore[reportReturnType]
+
+
+def _as_columns(camera: Camera, shown: Interval, known: Bits, margin_px: Floats) -> Interval:
+    """Columns of pixels that hold what is shown between two tangents; without bounds where these are not known."""
+    low, high = shown
     low, high = camera.u0 + camera.focal_u_px * low - margin_px, camera.u0 + camera.focal_u_px * high + margin_px
     low, high = lowered(low, np.abs(low)), raised(high, np.abs(high))
     return np.where(known, np.floor(low), -np.inf), np.where(known, np.floor(high), np.inf)
-
-
-def _line_sways(view: View, low: Floats, high: Floats) -> tuple[tuple[Floats, Floats, Floats], Bits]:
-    """How far the components of n = k f - e may be from those by the rotation in the middle, (markings, 1, sets); True where finite.
-
-    Before its rotation n is (-1, k cos(c), k sin(c)): one about Y moves its first and third, one about Z then the first and second.
-    """
-    turns, largest = view.turns, np.maximum(np.abs(low), np.abs(high))
-    per = 1 / view.fall.min(axis=0)
-    fore, down = (
-        largest * (np.abs(view.sine).max(axis=0) + view.bulge) * per,
-        largest * (np.abs(view.cosine).max(axis=0) + view.bulge) * per,
-    )
-    first, third = np.abs(turns.cos_b) + np.abs(turns.sin_b) * fore, np.abs(turns.sin_b) + np.abs(turns.cos_b) * fore
-    by_b = turns.off_b * (third + turns.off_b * first)
-    off_third = turns.off_b * (first + turns.off_b * third)
-    cos_a, sin_a = np.abs(turns.cos_a), np.abs(turns.sin_a)
-    one, other = cos_a * first + sin_a * down, sin_a * first + cos_a * down
-    off_first = by_b * cos_a + turns.off_a * (other + by_b + turns.off_a * (one + by_b))
-    off_second = by_b * sin_a + turns.off_a * (one + by_b + turns.off_a * (other + by_b))
-    return (off_first, off_second, off_third), np.isfinite(off_first)
 
 
 def _middle_point(camera: Camera, sets: StateSet, view: View, offset: Interval, near: Interval, far: Interval) -> tuple[Floats, Floats]:
@@ -402,7 +349,7 @@ def _middle_point(camera: Camera, sets: StateSet, view: View, offset: Interval, 
     return ((turns.cos_a * x - turns.sin_a * down) / z)[None, None], ((turns.sin_a * x + turns.cos_a * down) / z)[None, None]
 
 
-def _product(first: Interval, second: Interval) -> Interval:
-    """Range of a product of intervals, without rounding."""
-    sides = [one * other for one in first for other in second]
-    return np.minimum.reduce(sides), np.maximum.reduce(sides)
+def _bounds_where(bound: Bits, dark: Bits, low: Floats, high: Floats) -> Interval:
+    """The bounds where there are some; inverted where nothing is lit."""
+    bound = bound & np.isfinite(low) & np.isfinite(high)
+    return np.where(dark, np.inf, np.where(bound, low, -np.inf)), np.where(dark, -np.inf, np.where(bound, high, np.inf))

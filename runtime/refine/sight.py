@@ -13,6 +13,7 @@ from runtime.refine.interval import Bits
 from runtime.refine.lit_columns import LitColumns, at_both_borders
 from runtime.refine.lit_pixels import LitPixels
 from runtime.refine.missed import Missed
+from runtime.refine.optics import Optics
 from runtime.refine.sensor_borders import SensorBorders
 from runtime.scene import Scene
 from runtime.state_set import StateSet
@@ -40,9 +41,12 @@ class Sight:
     vouched: Vouched | None
 
     @staticmethod
-    def of(scene: Scene, sets: StateSet, witnesses: LitPixels, missed_budget: int, vouched: Vouched | None) -> Sight:
-        """Looks at the frame where the sets' markings may be."""
-        borders = (Borders if sets.roll is None else SensorBorders).of(scene, sets, witnesses)
+    def of(
+        scene: Scene, sets: StateSet, witnesses: LitPixels, missed_budget: int, vouched: Vouched | None, optics: Optics | None = None
+    ) -> Sight:
+        """Looks at the frame where the sets' markings may be; behind a lens, whose `optics` these are, the frame is the sensor's own."""
+        ideal = sets.roll is None and optics is None
+        borders = Borders.of(scene, sets, witnesses) if ideal else SensorBorders.of(scene, sets, witnesses, optics)
         halves, rows = LitColumns.of(witnesses, borders)
         crossed = at_both_borders(borders.crossed)
         return Sight(scene, borders, halves, crossed, rows, Missed.count(missed_budget, borders, halves, crossed), vouched)
@@ -59,6 +63,6 @@ def _of_sets(part: Any, numbers: NDArray[np.int64]) -> Any:
         return part.take(numbers, axis=-1)
     if isinstance(part, tuple):
         return tuple(_of_sets(side, numbers) for side in part)
-    if is_dataclass(part):
+    if is_dataclass(part) and not isinstance(part, Optics):
         return type(part)(*(_of_sets(getattr(part, field.name), numbers) for field in fields(part)))
     return part

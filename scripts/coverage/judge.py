@@ -10,14 +10,14 @@ from __future__ import annotations
 import zlib
 from collections import Counter
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from rational_image import Frame, RationalState
 
 from coverage.frames import Picture
 from coverage.scenarios import Scenario
-from coverage.states import Stage, estimator_of, image_of, spatial_mask
+from coverage.states import Floats, Stage, estimator_of, image_of, spatial_mask
 from runtime import Estimate
 
 GRID = 1e-4
@@ -81,11 +81,19 @@ class Violation:
     fault: str
 
 
+class TrueState(Protocol):
+    """What can be asked for exactly: a `RationalState`, or one of a turned camera."""
+
+    def within(self, lower: Floats, upper: Floats, /) -> bool:
+        """True if the state lies in a box, borders included."""
+        ...
+
+
 @dataclass(frozen=True)
 class Judged:
     """A state that the certificate must hold for, and the pixels of its runway that are lit in the frame."""
 
-    state: RationalState
+    state: TrueState
     lit: Frame
 
 
@@ -132,9 +140,9 @@ def extra_pixels(picture: Picture, state: RationalState) -> int:
     return min(int((picture.frame & ~own & spatial_mask(stage.path, cell)).sum()) for cell in stage.cells_of(state))
 
 
-def faults_of(picture: Picture, judged: list[Judged], estimate: Estimate) -> list[tuple[str, RationalState]]:
+def faults_of(picture: Picture, judged: list[Judged], estimate: Estimate) -> list[tuple[str, TrueState]]:
     """What an estimate claims and is not so, each with the state that shows it."""
-    faults = []
+    faults: list[tuple[str, TrueState]] = []
     for each in judged:
         if estimate.box is None:
             faults.append(("no runway", each.state))

@@ -16,7 +16,7 @@ import resource
 import secrets
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
@@ -56,21 +56,23 @@ class Campaign:
     version: str
     """Digest of the code that decides what a scene is and what is said of it."""
 
+    trial_of: Callable[[int, int, int, float, str], Trial] = Trial
+
     @property
     def trials(self) -> list[Trial]:
         """One trial a scene; the frames are shared out among them."""
         share, rest = divmod(self.frames, self.scenes)
-        return [Trial(self.seed, scene, share + (scene < rest), self.patience_s, self.version) for scene in range(self.scenes)]
+        return [self.trial_of(self.seed, scene, share + (scene < rest), self.patience_s, self.version) for scene in range(self.scenes)]
 
     def journal(self, path: Path) -> ResultJournal[Outcomes]:
         """What is finished of this campaign."""
         return ResultJournal(path, (trial.key for trial in self.trials), Outcomes.read, Outcomes.tables)
 
 
-def version_of_code() -> str:
-    """Digest of all that a trial depends on."""
+def version_of_code(module: str = "random_scenes.trial") -> str:
+    """Digest of all that a trial depends on, which is of this module."""
     roots = Path(runtime.__file__).parents[1], Path(__file__).parents[1]
-    return digest(all_imports_of(["random_scenes.trial"], roots).values())
+    return digest(all_imports_of([module], roots).values())
 
 
 def seed_of_stopped(journal: Path, version: str, scenes: int) -> int | None:
@@ -92,7 +94,7 @@ def outcomes_of(trials: list[Trial], jobs: int) -> Iterator[tuple[Trial, Outcome
     while waiting:
         pool = ProcessPoolExecutor(jobs, initializer=limit_memory)
         try:
-            futures = {pool.submit(Trial.run, trial): trial for trial in waiting}
+            futures = {pool.submit(trial.run): trial for trial in waiting}
             for future in as_completed(futures):
                 outcomes = future.result()
                 del waiting[futures[future]]
@@ -109,7 +111,7 @@ def outcomes_alone(trial: Trial) -> Outcomes:
     """A trial's outcomes from a process of its own, whose end is a finding."""
     with ProcessPoolExecutor(1, initializer=limit_memory) as pool:
         try:
-            return pool.submit(Trial.run, trial).result()
+            return pool.submit(trial.run).result()
         except BrokenProcessPool as error:
             return Outcomes(findings=[Finding(f"{trial.seed}/{trial.scene}", "the process ends", str(error), ())])
 
@@ -146,6 +148,9 @@ def table_of_kinds(counts: dict[str, Counter[str]]) -> Table:
     return view
 
 
+TableOfKinds = Callable[[dict[str, Counter[str]]], Table]
+
+
 def table_of_findings(findings: list[Finding]) -> Table:
     """Findings by fault: how many, in how many scenes, and the first of them."""
     view = Table(title="Findings", title_justify="left")
@@ -158,13 +163,14 @@ def table_of_findings(findings: list[Finding]) -> Table:
     return view
 
 
-def report(campaign: Campaign, journal: ResultJournal[Outcomes], output: Path) -> int:
-    """Writes the JSON, prints the tables and the findings, and returns how many there are."""
+def report(campaign: Campaign, journal: ResultJournal[Outcomes], output: Path, table: TableOfKinds = table_of_kinds) -> int:
+    """Writes the JSON, prints the tables and the findings of what is finished, and returns how many findings there are."""
     total = Outcomes()
     for trial in campaign.trials:
-        total.add(journal.done[trial.key])
+        if trial.key in journal.done:
+            total.add(journal.done[trial.key])
     console = terminal.console(200)
-    console.print(table_of_kinds(total.counts))
+    console.print(table(total.counts))
     print(f"seed {campaign.seed}; {total.refused.total()} draws refused: {dict(total.refused.most_common())}")
     if total.findings:
         console.print(table_of_findings(total.findings))
@@ -174,14 +180,14 @@ def report(campaign: Campaign, journal: ResultJournal[Outcomes], output: Path) -
     return len(total.findings)
 
 
-def replay(place: str, patience_s: float, folder: Path) -> int:
+def replay(place: str, patience_s: float, folder: Path, trial_of: Callable[[int, int, int, float], Trial] = Trial) -> int:
     """Builds a scene again and judges a frame of it, or its first ones; keeps model and frame. Returns the number of findings."""
     parts = re.fullmatch(r"(\d+)/(\d+)(?:\.(\d+))?(?:#(\d+))?", place)
     if parts is None:
         raise typer.BadParameter(f'found {place!r}; give "SEED/SCENE.DRAW#FRAME" as the report of a finding does')
     seed, scene, draw, frame = (None if part is None else int(part) for part in parts.groups())
     limit_memory()
-    trial, outcomes = Trial(seed or 0, scene or 0, 50, patience_s), Outcomes()
+    trial, outcomes = trial_of(seed or 0, scene or 0, 50, patience_s), Outcomes()
     path = folder / "replayed.onnx"
     built = trial.first_built(path, outcomes) if draw is None else trial.built(draw, path)
     if built is not None:
@@ -207,16 +213,32 @@ def main(
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     if replayed is not None:
         sys.exit(int(replay(replayed, patience, output.parent) > 0))
-    path, version = output.with_suffix(".scenes.jsonl"), version_of_code()
+    sys.exit(int(run(version_of_code(), scenes, frames, seed, jobs, patience, output) > 0))
+
+
+def run(
+    version: str,
+    scenes: int,
+    frames: int,
+    seed: int | None,
+    jobs: int,
+    patience: float,
+    output: Path,
+    trial_of: Callable[[int, int, int, float, str], Trial] = Trial,
+    table: TableOfKinds = table_of_kinds,
+) -> int:
+    """Runs a campaign, or what is left of it, and reports; returns the number of findings. Ends the process if it is stopped."""
+    path = output.with_suffix(".scenes.jsonl")
     if seed is None:
         stopped = seed_of_stopped(path, version, scenes)
         seed = secrets.randbelow(2**32) if stopped is None else stopped
     print(f"seed {seed}", file=sys.stderr)
-    campaign = Campaign(seed, scenes, frames, patience, version)
+    campaign = Campaign(seed, scenes, frames, patience, version, trial_of)
     journal = campaign.journal(path)
     try:
         run_campaign(campaign, journal, jobs)
     except KeyboardInterrupt:
         print(f"stopped: {len(journal.done)} of {scenes} scenes are kept in {journal.path}; the same command goes on", file=sys.stderr)
+        report(campaign, journal, output, table)
         sys.exit(130)
-    sys.exit(int(report(campaign, journal, output) > 0))
+    return report(campaign, journal, output, table)

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from coverage.judge import faults_of, judged_states
+from coverage.judge import Judged, faults_of, judged_states
 from coverage.states import estimator_of
 
 from random_scenes.frames import DrawnFrame
@@ -35,15 +35,17 @@ class FrameTrial:
     number: int
     numbers: Counter[str] = field(default_factory=Counter)
     findings: list[Finding] = field(default_factory=list)
+    refusals: list[str] = field(default_factory=list)
+    """Why the estimator refuses what the frame asks of it: none of a level camera's."""
     seconds: float = 0.0
     endless: bool = False
 
     def run(self, patience_s: float) -> None:
         """Judges the frame's two estimates."""
         picture, extreme = self.frame.picture, self.frame.extreme
-        judged = judged_states(picture, *self.frame.budgets, True)
+        judged = self.judged()
         boxes = []
-        for refine in (True, False):
+        for refine in self.refinements:
             estimate = self.estimated(refine, patience_s)
             if estimate is None:
                 continue
@@ -51,20 +53,33 @@ class FrameTrial:
                 self.find(f"{'refined' if refine else 'unrefined'}: {kind_of(fault)}", f"{fault}; state {state}")
             boxes += [] if estimate.box is None else [estimate.box]
         self.numbers.update(frames=1, judged=len(judged), findings=len(self.findings))
-        if len(boxes) == 2:
-            narrower = (boxes[0].half_widths < NARROWER * boxes[1].half_widths).any()
+        if len(boxes) == len(self.refinements):
+            narrower = (boxes[0].half_widths < NARROWER * boxes[-1].half_widths).any()
             self.numbers.update(certified=1, narrower=int(narrower))
             if extreme is not None and any(each.state is extreme.state for each in judged):
                 self.numbers.update(extremes=1, reached=int(extreme.in_outer_part(boxes[0], OUTER_PART)))
+
+    @property
+    def refinements(self) -> tuple[bool, ...]:
+        """With refinement, and without."""
+        return True, False
+
+    def estimate(self, refine: bool) -> Estimate:
+        """The frame's estimate."""
+        return estimator_of(str(self.built.path), *self.frame.budgets).estimate(self.frame.picture.frame, refine=refine)
+
+    def judged(self) -> list[Judged]:
+        """The states that the box must hold."""
+        return judged_states(self.frame.picture, *self.frame.budgets, True)
 
     def estimated(self, refine: bool, patience_s: float) -> Estimate | None:
         """The estimate; None, and a finding, where there is none in time."""
         start = time.process_time()
         try:
             with watched(patience_s):
-                estimator = estimator_of(str(self.built.path), *self.frame.budgets)
+                estimator_of(str(self.built.path), *self.frame.budgets)  # loaded before the clock starts
                 start = time.process_time()
-                return estimator.estimate(self.frame.picture.frame, refine=refine)
+                return self.estimate(refine)
         except OutOfTimeError as error:
             self.endless = True
             self.find("a frame does not end", f"in {patience_s:g} s, then at {'{}:{}'.format(*raised_in(error))}, refine={refine}")

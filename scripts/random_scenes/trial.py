@@ -90,25 +90,31 @@ class Trial:
     def judge_frames(self, built: BuiltScene, numbers: Iterable[int], outcomes: Outcomes, keep: Path | None = None) -> None:
         """Judges frames of a built scene, and compares their times; keeps the frames in a folder if one is given."""
         outcomes.count(built.drawn.kinds, Counter(scenes=1))
-        budgets = draw_budgets(np.random.default_rng([self.seed, self.scene]), built)
         trials: list[FrameTrial] = []
         for number in numbers:
             try:
-                frame = draw_frame(np.random.default_rng([self.seed, self.scene, number]), built, budgets)
+                trial = self.frame_trial(built, number)
             except Exception as error:  # a fault of the campaign, which is not to end it unseen
                 outcomes.findings.append(Finding(f"{built.place}#{number}", "a frame cannot be drawn", described(error), built.drawn.kinds))
                 continue
             if keep is not None:
-                np.save(keep / f"replayed-{number}.npy", frame.picture.frame)
-            trials.append(FrameTrial(built, frame, number))
-            trials[-1].run(self.patience_s)
+                np.save(keep / f"replayed-{number}.npy", trial.frame.picture.frame)
+            trials.append(trial)
+            trial.run(self.patience_s)
             if sum(trial.endless for trial in trials) == MOST_ENDLESS:
                 break
         find_slow(trials)
         for trial in trials:
             outcomes.count(trial.frame.kinds, trial.numbers)
+            outcomes.refused.update(trial.refusals)
             outcomes.findings += trial.findings
         outcomes.findings = outcomes.findings[:MOST_FINDINGS]
+
+    def frame_trial(self, built: BuiltScene, number: int) -> FrameTrial:
+        """Frame number `number` of a built scene, drawn."""
+        budgets = draw_budgets(np.random.default_rng([self.seed, self.scene]), built)
+        frame = draw_frame(np.random.default_rng([self.seed, self.scene, number]), built, budgets)
+        return FrameTrial(built, frame, number)
 
     def prove(self, built: BuiltScene, outcomes: Outcomes) -> None:
         """Has `verify-model` prove a model, and counts it under the outcome."""
