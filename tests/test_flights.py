@@ -16,6 +16,7 @@ from flights import campaign
 from flights.course import Course, bounds, draw_motion, theta_ball, theta_bounds, turned
 from flights.faulty import FAULTS, FaultyFlight
 from flights.sound import SoundFlight
+from flights.turned import TurnedFlight
 from random_scenes.outcomes import Outcomes
 from typer.testing import CliRunner
 
@@ -39,6 +40,21 @@ def test_sound_flights_have_no_finding() -> None:
     assert counts["frames"] == counts["certified"] == 80
     for kind in ("late", "broken", "priors", "told", "predicted"):
         assert counts[kind] > 2
+
+
+def turned_flight(number: int) -> Outcomes:
+    """A flight of a camera that rolls and yaws."""
+    return TurnedFlight(MODEL, str(number), np.random.default_rng([7, number])).run()
+
+
+def test_a_flight_with_roll_and_yaw_has_no_finding(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flights.turned.FRAMES", 5)
+    outcomes = turned_flight(2)
+    counts = outcomes.counts["turned"]
+    assert outcomes.findings == []
+    assert counts["frames"] == counts["certified"] == 5
+    monkeypatch.setattr(tracker.Seen, "later", lambda seen, _: seen)  # a tracker that forgets the motion
+    assert {"not certified"} <= {finding.fault for finding in turned_flight(2).findings}
 
 
 def test_a_tracker_that_forgets_the_motion_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:

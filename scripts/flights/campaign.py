@@ -2,10 +2,11 @@
 
     python scripts/flights [MODEL.onnx ...] [--flights N] [--scenes N] [--no-faults] [--seed N] [-o FILE.json]
 
-Sound flights (`flights.sound`) keep all assumptions: a box without the state, at a frame or between two, INCONSISTENT, an exception and
-a frame without end are findings, with which the exit code is 1. On faulty ones (`flights.faulty`) one assumption is broken. Sound ones are
-flown over scenes that are drawn at random, too (`random_scenes`). The runway's images are drawn in rational numbers by code that the
-build does not have (`rational_image`). A campaign that was stopped goes on, from what is kept beside the output.
+Sound flights (`flights.sound`, and of a camera that rolls and yaws `flights.turned`) keep all assumptions: a box without the state, at
+a frame or between two, INCONSISTENT, an exception and a frame without end are findings, with which the exit code is 1. On faulty ones
+(`flights.faulty`) one assumption is broken. Sound ones are flown over scenes that are drawn at random, too (`random_scenes`). The
+runway's images are drawn in rational numbers by code that the build does not have (`rational_image`). A campaign that was stopped goes
+on, from what is kept beside the output.
 """
 
 from __future__ import annotations
@@ -38,15 +39,16 @@ from rich.table import Table
 import runtime
 from flights.faulty import FAULTS, LATE, FaultyFlight
 from flights.sound import PATIENCE_S, SHORT_FLIGHT, SoundFlight
+from flights.turned import TurnedFlight
 from runtime import terminal
 from runtime.errors import INTERRUPTED, fail
 from runtime.model.format import ModelError
 from runtime.whole_file import OutputError, write_whole
 
 PAPER = Path(__file__).resolve().parents[2] / "models" / "paper.onnx"
-SOUND, SCENE = "sound", "random scene"
-FAULTY_SHARE = 10
-"""One flight with each fault for so many sound ones."""
+SOUND, TURNED, SCENE = "sound", "turned", "random scene"
+FAULTY_SHARE, TURNED_SHARE = 10, 20
+"""One flight with each fault, and one of a camera that rolls and yaws, whose frames take far longer, for so many sound ones."""
 FLIGHTS_OF_A_SCENE = 10
 
 
@@ -73,8 +75,10 @@ class Task:
 
     def flown(self) -> Outcomes:
         """Over the model's scene."""
-        rng = np.random.default_rng([self.seed, self.number, [SOUND, *FAULTS].index(self.kind)])
+        rng = np.random.default_rng([self.seed, self.number, [SOUND, *FAULTS, TURNED].index(self.kind)])
         place = f"{self.model}: {self.kind} {self.seed}/{self.number}"
+        if self.kind == TURNED:
+            return TurnedFlight(self.path, place, rng).run()
         return SoundFlight(self.path, place, rng).run() if self.kind == SOUND else FaultyFlight(self.path, self.kind, place, rng).run()
 
     def scene_flown(self) -> Outcomes:
@@ -105,8 +109,9 @@ def tasks_of(version: str, seed: int, models: list[Path], flights: int, scenes: 
     shares: dict[float, list[Task]] = {}
     for path in models:
         model = f"{path.stem} {estimator_of(str(path)).sha256[:16]}"
-        for kind in (SOUND, *(FAULTS if faults else ())):
-            count = flights if kind == SOUND else -(-flights // FAULTY_SHARE)
+        counts = {SOUND: flights, TURNED: flights // TURNED_SHARE}
+        counts |= dict.fromkeys(FAULTS, -(-flights // FAULTY_SHARE)) if faults else {}
+        for kind, count in counts.items():
             for number in range(count):
                 shares.setdefault(number / count, []).append(Task(version, seed, kind, model, str(path), number))
     for number in range(scenes):
@@ -122,7 +127,7 @@ def flown(tasks: list[Task], jobs: int) -> Iterator[tuple[Task, Outcomes]]:
 def version_of_code() -> str:
     """Digest of all that a flight depends on."""
     roots = Path(runtime.__file__).parents[1], Path(__file__).parents[1]
-    return digest(all_imports_of(["flights.sound", "flights.faulty", "random_scenes.trial"], roots).values())
+    return digest(all_imports_of(["flights.sound", "flights.turned", "flights.faulty", "random_scenes.trial"], roots).values())
 
 
 def main(
@@ -181,8 +186,10 @@ def table_of_sound(total: dict[str, Outcomes]) -> Table:
     columns = ("frames", "certified", "broken", "priors", "told", "late", "predicted", "findings")
     table = Table("sound flights", *columns, title_justify="left")
     for name, outcomes in total.items():
-        counts = outcomes.counts.get(SOUND, {})
-        table.add_row(name, *(f"{counts.get(column, 0):,}" for column in columns))
+        for kind in (SOUND, TURNED):
+            counts = outcomes.counts.get(kind, {})
+            if counts:
+                table.add_row(name if kind == SOUND else f"{name}, {kind}", *(f"{counts.get(column, 0):,}" for column in columns))
     return table
 
 
