@@ -12,7 +12,7 @@ import pytest
 from flint import arb, ctx
 from hypothesis import assume, given
 from hypothesis import strategies as st
-from rational_image import BallLens, RationalState, RationalView
+from rational_image import RationalState, RationalView
 from scenes import FREE_X, PAPER, examples
 from test_contractors import WHOLE, Case, cases, clutter_of, spoiled
 from test_lens import FISHEYE, WIDE
@@ -100,11 +100,24 @@ def test_the_refinement_keeps_the_state_whatever_the_lens_and_the_camera(off: Of
     assert any(case.held_by(left[np.array([number])]) for number in range(len(left)))
 
 
+def by_lens(view: RationalView, x: arb, y: arb) -> tuple[arb, arb]:
+    """OpenCV's models of a lens, term by term."""
+    if view.lens is None:
+        return x, y
+    k, square = [arb(float(value)) for value in view.lens.coefficients], x * x + y * y
+    if view.lens.fisheye:
+        angle = square.sqrt().atan()
+        scale = angle * (1 + k[0] * angle**2 + k[1] * angle**4 + k[2] * angle**6 + k[3] * angle**8) / square.sqrt()
+        return x * scale, y * scale
+    k1, k2, p1, p2, k3 = [*k, arb(0)][:5]
+    scale = 1 + k1 * square + k2 * square**2 + k3 * square**3
+    return x * scale + 2 * p1 * x * y + p2 * (square + 2 * x * x), y * scale + p1 * (square + 2 * y * y) + 2 * p2 * x * y
+
+
 def shown(view: RationalView, state: RationalState, x: Fraction, z: Fraction) -> tuple[arb, arb]:
     """Column and row of a ground point, as a ball."""
     right, down, ahead = (arb(part.numerator) / part.denominator for part in view.in_camera(state, x, z))
-    lens = view.lens or BallLens(False, (Fraction(0),) * 5)
-    across, below = lens.shown(right / ahead, down / ahead)
+    across, below = by_lens(view, right / ahead, down / ahead)
     column, row = (arb(side.numerator) / side.denominator for side in (view.u0, view.v0))
     focal_u, focal_v = (arb(side.numerator) / side.denominator for side in (view.focal_u, view.focal_v))
     return column + focal_u * across, row + focal_v * below
