@@ -16,8 +16,6 @@ def assumptions(scene: Scene) -> list[str]:
         f"{_turn_of(scene)}, and the camera as in the scene, up to its [calibration] and {tolerance.line_px} px.",
         f"At most {tolerance.missed_budget} pixels of the runway's image have no lit pixel{near}.",
     ]
-    if scene.camera.pinhole and not scene.calibration.exact:
-        lines.append("No more of the camera's own image have none within what [calibration] leaves of line_px.")
     if tolerance.extra_budget >= 0:
         lines.append(f"At most {tolerance.extra_budget} lit pixels of the true cell's spatial mask are not the runway's{near}.")
     return lines
@@ -38,9 +36,11 @@ def attitude_assumptions(scene: Scene, attitude: str, runs: int) -> list[str]:
     """What takes the place of the first two assumptions where the camera has a roll and a yaw; `attitude` in words."""
     tolerance = scene.tolerance
     near = f" and {tolerance.line_px} px" if tolerance.line_px else ""
+    left = ["For `line_px` stands below what [calibration] leaves of it."] if scene.camera.pinhole and not scene.calibration.exact else []
     return [
         "The state lies in the scene's domain with the pitch that the ideal frame shows, atan(tan(theta)/cos(yaw)), in the place of theta.",
         f"The camera has a {attitude}, and is as in the scene, up to its [calibration]{near}; NN_F saw {runs} painted frames.",
+        *left,
     ]
 
 

@@ -243,7 +243,7 @@ class Estimator:
         cut = None if known is None else partial(within, self.ideal.camera, known=known)
         if found.turned is not None:
             return found.turned.left(self._sensor_refiner, cut, refine)
-        if self.sensor.optics:
+        if self.sensor.map is not None:
             entries = self._entries.sets(found.passes)
             entries = entries if cut is None else cut(entries)
             lit = witnesses(found.pixels.view(np.bool_), self.beside_px)

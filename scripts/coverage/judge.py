@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Protocol
 
 import numpy as np
-from rational_image import Frame, RationalState, RunwayImage
+from rational_image import Frame, RationalState
 
 from coverage.frames import Picture
 from coverage.scenarios import Scenario
@@ -123,20 +123,9 @@ def judged_states(picture: Picture, missed: int, extra: int, runway: bool) -> li
         if not stage.contains(state):
             continue
         image, seen = image_of(stage.counted(picture.camera), state), image_of(picture.camera, state).frame
-        if keeps_budget(picture, state, image, missed) and (extra < 0 or extra_pixels(picture, state) <= extra):
+        if stage.unwitnessed(image, picture.frame) <= missed and (extra < 0 or extra_pixels(picture, state) <= extra):
             judged.append(Judged(state, seen & picture.frame))
     return judged
-
-
-def keeps_budget(picture: Picture, state: RationalState, image: RunwayImage, missed: int) -> bool:
-    """No more than `missed` pixels are dark: of the image that NN_F looks for, and of that of the camera itself, where it may be off."""
-    stage, camera = picture.stage, picture.camera
-    if stage.unwitnessed(image, picture.frame) > missed:
-        return False
-    if stage.scene.calibration.exact or camera.lens is not None:
-        return True
-    beside_px = estimator_of(stage.path).beside_px
-    return stage.unwitnessed(image_of(camera, state), picture.frame, beside_px) <= missed
 
 
 def pixels_lost(judged: Judged, estimate: Estimate) -> int:

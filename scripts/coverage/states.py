@@ -82,12 +82,9 @@ class Stage:
         altitudes = domain.altitude_borders[met]
         return float(altitudes[:, 0].min()), float(altitudes[:, -1].max())
 
-    def unwitnessed(self, image: RunwayImage, frame: Frame, beside_px: int | None = None) -> int:
-        """Number of pixels of an image without a lit pixel of the frame within the tolerance; what is out of view counts as lit.
-
-        `beside_px`: a number of pixels in the place of the tolerance.
-        """
-        line_px, (height, width) = self.scene.tolerance.line_px if beside_px is None else beside_px, frame.shape
+    def unwitnessed(self, image: RunwayImage, frame: Frame) -> int:
+        """Number of pixels of an image without a lit pixel of the frame within the tolerance; what is out of view counts as lit."""
+        line_px, (height, width) = self.scene.tolerance.line_px, frame.shape
         seen = np.zeros(len(image.rows), dtype=np.bool_)
         for down, right in itertools.product(range(-line_px, line_px + 1), repeat=2):
             rows, columns = image.rows + down, image.columns + right
