@@ -53,8 +53,8 @@ class Row:
 
     @property
     def level(self) -> bool:
-        """True if no attitude is told."""
-        return self.roll == self.yaw == self.plus_minus == 0
+        """True if no attitude is told; of a camera that may be off, it is, so that its plus-minus counts by what it is."""
+        return self.roll == self.yaw == self.plus_minus == 0 and self.camera != "off"
 
 
 CAMERAS = {

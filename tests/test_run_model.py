@@ -593,7 +593,7 @@ def test_a_gyroscope_makes_the_box_smaller_and_a_wrong_one_is_found(recording, t
     assert (done.exit_code, done.stderr) == (0, "")
     rows = rows_of(tmp_path)
     assert [row["tracked_truth_inside"] for row in rows] == ["0" if number == 7 else "1" for number in range(WINDOWS)]
-    assert np.median(widths(rows, "tracked_")) < 0.9 * np.median(without)
+    assert np.median(widths(rows, "tracked_")) < min(0.0165, 0.95 * np.median(without))
     assert "within the plus-minus of" in " ".join(done.stdout.split())
     assert invoke(*options, "--gyroscope", gyroscope_file(tmp_path / "bad.csv", 3.0)).exit_code == 0
     assert "inconsistent" in {row["tracked_outcome"] for row in rows_of(tmp_path)}

