@@ -16,7 +16,6 @@ from rational_image import RationalState, RationalView, turn
 from scenes import PAPER, examples
 
 from runtime.refine.altitude import contract_by_altitude
-from runtime.refine.border_pairs import contract_by_border_pairs, horizon_bounds, scales_at_borders
 from runtime.refine.borders import Borders
 from runtime.refine.crossings import offsets_at_crossings
 from runtime.refine.end_pixels import offsets_at_ends
@@ -26,6 +25,7 @@ from runtime.refine.interval import relaxed_intersection
 from runtime.refine.lit_pixels import LitPixels
 from runtime.refine.missed import HalfWindows
 from runtime.refine.offsets import contract_by_offsets
+from runtime.refine.scales import contract_by_scales, horizon_bounds, scales_at_borders
 from runtime.refine.sight import Sight, Vouched
 from runtime.refine.vouched import contract_by_vouched, offsets_by_vouched
 from runtime.scene import Axis, Camera, Domain, Marking, Runway, Scene, SceneError
@@ -36,7 +36,7 @@ WHOLE = slice(None), slice(None)
 CONTRACTORS = {
     "offsets": contract_by_offsets,
     "vouched": contract_by_vouched,
-    "border pairs": contract_by_border_pairs,
+    "scales": contract_by_scales,
     "ends": contract_by_ends,
 }
 SOURCES = {"crossings": offsets_at_crossings, "end pixels": offsets_at_ends, "vouched": offsets_by_vouched}
@@ -296,7 +296,7 @@ def test_offsets_tell_the_scale_and_the_track(case: Case) -> None:
         bounds = [SOURCES[name](wide.sets, sight) for name in ("crossings", "end pixels")]
         low, high = max(low[0, 0] for low, _ in bounds), min(high[0, 0] for _, high in bounds)
         across, scale = case.scene.runway.x_m[0] - float(case.state.x), float(case.scale())
-        found = getattr(contract_by_offsets(wide.sets, sight), axis)[0]
+        found = getattr(contract_by_scales(contract_by_offsets(wide.sets, sight), sight), axis)[0]
         left = (high - low) / (abs(across) if axis == "scale" else scale)
         assert found[1] - found[0] <= left + 1e-5 * extent
 
@@ -322,7 +322,7 @@ def test_border_pairs_come_to_what_all_pairs_say(case: Case, extent: float, free
     least, most = all_pairs((sight.borders.row[:, 0] - camera.v0).tolist(), low, high)
     sets = wide.sets
     for _ in range(8):
-        sets = contract_by_border_pairs(sets, sight)
+        sets = contract_by_scales(sets, sight)
     start, stop = wide.sets.theta[0]
     expected = max(start, math.atan(least / camera.focal_v_px)), min(stop, math.atan(most / camera.focal_v_px))
     assert sets.theta[0].tolist() == pytest.approx(expected, abs=1e-7 * extent + 1e-12)

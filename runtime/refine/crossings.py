@@ -18,18 +18,29 @@ from runtime.state_set import StateSet
 def offsets_at_crossings(_: StateSet, sight: Sight) -> Interval:
     """Bounds on the offset (p_x - x) scale of each marking, (markings, sets), px."""
     borders, missed = sight.borders, sight.missed
-    first, last = sight.halves.first, sight.halves.last
     if missed.budget == 0:
-        bounds = borders.offsets(sight.scene, at_borders(first, np.maximum), at_borders(last, np.minimum))
-        low, high = _where(borders.crossed, *bounds)
+        low, high = borders.offsets(sight.scene, *columns_at_borders(sight))
         return np.maximum.reduce(low, axis=1), np.minimum.reduce(high, axis=1)
     usable = sight.crossed & ~missed.halves
     upper, lower = (
-        _where(usable[half], *borders.offsets(sight.scene, first[half], last[half], rows))
+        _where(usable[half], *borders.offsets(sight.scene, sight.halves.first[half], sight.halves.last[half], rows))
         for half, rows in enumerate((slice(None, -1), slice(1, None)))
     )
     low, high = intersected(upper, lower)
     return relaxed_intersection(low, high, np.maximum(missed.left, 0), missed.budget)
+
+
+def columns_at_borders(sight: Sight) -> Interval:
+    """First and last column that each marking can cross each border in, by the closer of the two rows there, (markings, rows + 1, sets).
+
+    Infinite where nothing is told. They hold for sets without missed pixels left.
+    """
+    halves, missed = sight.halves, sight.missed
+    if missed.budget == 0:
+        none = np.where(sight.borders.crossed, 0.0, np.inf)
+        return at_borders(halves.first, np.maximum) - none, at_borders(halves.last, np.minimum) + none
+    none = np.where(sight.crossed & ~missed.halves, 0.0, np.inf)
+    return at_borders(halves.first - none, np.maximum), at_borders(halves.last + none, np.minimum)
 
 
 def _where(usable: Bits, low: Floats, high: Floats) -> Interval:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from runtime.refine.borders import Borders
 from runtime.refine.crossings import offsets_at_crossings
 from runtime.refine.end_pixels import offsets_at_ends
 from runtime.refine.interval import Interval, intersected
@@ -29,7 +30,7 @@ def contract_by_offsets(sets: StateSet, sight: Sight) -> StateSet:
     """
     if isinstance(sight.borders, SensorBorders) and sight.borders.unknowns is not None:
         return contract_by_sheared_offsets(sets, sight)
-    low, high = functools.reduce(intersected, (source(sets, sight) for source in SOURCES if sight.vouched or source != offsets_by_vouched))
+    low, high = functools.reduce(intersected, (source(sets, sight) for source in SOURCES if _may_tell(source, sets, sight)))
     refuted = np.logical_or.reduce(low > high, axis=0) | (sight.missed.left < 0)
     offset = np.where(refuted, 0.0, low), np.where(refuted, 0.0, high)
     x = sight.borders.seen_x(sets)
@@ -37,3 +38,11 @@ def contract_by_offsets(sets: StateSet, sight: Sight) -> StateSet:
     if seen_x is None:
         return sets.contracted(scale=scale).emptied(refuted | (scale[0] > scale[1]))
     return sets.contracted(scale=scale, x=sight.borders.true_x(sets, *seen_x)).emptied(refuted | (scale[0] > scale[1]))
+
+
+def _may_tell(source: Callable[[StateSet, Sight], Interval], sets: StateSet, sight: Sight) -> bool:
+    """Does the source tell what no other contractor does? With x known and none missed, what crossings tell is in the scales (`scales`)."""
+    if source == offsets_at_crossings:
+        x_known = (sets.x[:, 0] == sets.x[:, 1]).all()
+        return not (isinstance(sight.borders, Borders) and x_known and (sight.missed.left <= 0).all())
+    return source != offsets_by_vouched or sight.vouched is not None

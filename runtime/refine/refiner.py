@@ -6,7 +6,7 @@ what the frame shows. A state whose markings cross the border r of two rows ligh
     u(r) = u0 + (p_x - x) scale R(theta, r)  lies in the closed columns of a lit pixel above r, and of one below r
 
 up to the missed pixels. In a thin slice R is all but a number, and every border bounds each marking's offset (p_x - x) scale on both
-sides; so does, if none may be missed, the lit pixel of an end, and two borders bound theta (`border_pairs`). Beyond the rows that all
+sides; so does, if none may be missed, the lit pixel of an end, and two borders bound theta (`scales`). Beyond the rows that all
 states of the slice cross, the first row without a usable lit pixel ends a marking, and so bounds its distance. Slices that contradict the
 frame are dropped; the others are cut finer, in the end only those that carry a face of the box.
 
@@ -30,12 +30,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from runtime.refine.altitude import contract_by_altitude
-from runtime.refine.border_pairs import contract_by_border_pairs
 from runtime.refine.ends import contract_by_ends
 from runtime.refine.interval import Bits, Floats
 from runtime.refine.lit_pixels import LitPixels
 from runtime.refine.offsets import contract_by_offsets
 from runtime.refine.optics import Optics
+from runtime.refine.scales import contract_by_scales
 from runtime.refine.sight import Sight, Vouched
 from runtime.refine.vouched import contract_by_vouched
 from runtime.scene import Scene
@@ -44,7 +44,7 @@ from runtime.state_set import StateSet
 CONTRACTORS: tuple[Callable[[StateSet, Sight], StateSet], ...] = (
     contract_by_offsets,
     contract_by_vouched,
-    contract_by_border_pairs,
+    contract_by_scales,
     contract_by_ends,
 )
 """Each gives subsets of the sets that hold all their states which the frame allows; in the order in which one helps the next."""
@@ -81,7 +81,7 @@ class Search:
 
 FACES = 6
 """Of the box in theta, y and z that is searched."""
-NONE_MISSED = Search(first=32, sets=64, pieces=4, rounds=8, gain=0.02, z=2)
+NONE_MISSED = Search(first=48, sets=96, pieces=6, rounds=8, gain=0.06, z=2, scale=2)
 SOME_MISSED = Search(first=48, sets=144, pieces=6, rounds=20, gain=0.03, z=2, scale=2)
 """Missed pixels are counted where windows are a pixel or two wide (`missed`): then smaller pieces pay, cut along the scale too."""
 NARROWED = Search(first=48, sets=144, pieces=6, rounds=20, gain=0.01, z=2, scale=2, patience=2)

@@ -33,7 +33,7 @@ def hulls(lower: NDArray, upper: NDArray, parts: Sequence[NDArray[np.int64]], do
 def connected_parts(sets: StateSet) -> list[NDArray[np.int64]]:
     """Numbers of the sets in each connected part of their union: parts are joined where boxes (theta, x, y, z) touch.
 
-    Every round of the loops adds a set to a part or ends a part, so that there are no more rounds than twice the sets.
+    Every set is labelled with the smallest number that it is known to be connected to; each round of the loop lowers a label.
     """
     if len(sets) > MOST_TO_JOIN:
         return [np.arange(len(sets))]
@@ -41,13 +41,9 @@ def connected_parts(sets: StateSet) -> list[NDArray[np.int64]]:
     for low, high in (side.T for side in (sets.theta, sets.x, sets.y, sets.z)):
         touch &= low[:, None] <= high
     touch &= touch.T.copy()
-    left, parts = np.ones(len(sets), dtype=bool), []
-    for first in range(len(sets)):
-        if left[first]:
-            part, newest = np.zeros(len(sets), dtype=bool), np.array([first])
-            while len(newest):
-                part[newest] = True
-                newest = np.flatnonzero(np.logical_or.reduce(touch[newest], axis=0) & ~part)
-            parts.append(np.flatnonzero(part))
-            left &= ~part
-    return parts
+    labels, before = np.arange(len(sets)), np.zeros(0)
+    while not np.array_equal(labels, before):
+        before = labels
+        labels = np.minimum.reduce(np.where(touch, labels, len(sets)), axis=1, initial=len(sets))
+        labels = labels[labels]  # what is connected to a label's set has that set's label
+    return [np.flatnonzero(labels == label) for label in np.flatnonzero(labels == np.arange(len(sets)))]
