@@ -561,6 +561,21 @@ def test_windows_are_certified_over_time_too(recording, truth, tmp_path):
     assert "the state moves by theta -0.2 to 0.2 rad/s" in " ".join(done.stdout.split())
 
 
+def test_the_picture_shows_the_estimate_within_the_narrower_band(recording, truth, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr("runtime.recordings.report.draw_history", lambda *parts: drawn.append(parts[1]) or draw_history(*parts))
+    attitude = attitude_file(tmp_path / "attitude.csv", 0.004)
+    options = (MODEL, recording, "-o", tmp_path, "--truth", truth, "--no-video", "--track", "--motion", MOTION, "--attitude", attitude)
+    assert invoke(*options).exit_code == 0
+    names = [column.removeprefix("tracked_lower_") for column in TRACKED_COLUMNS if column.startswith("tracked_lower_")]
+    rows = [row for row in rows_of(tmp_path) if row["tracked_outcome"] == "certified"]
+    moments = [moment for moment in drawn[0].moments if moment.tracked is not None]
+    assert len(rows) == len(moments) == WINDOWS - 1
+    for row, moment in zip(rows, moments, strict=True):
+        assert moment.state.tolist() == pytest.approx([float(row[f"tracked_{name}"]) for name in names], rel=1e-6)
+        assert moment.tracked.contains(moment.state)
+
+
 def test_an_attitude_reference_makes_the_box_smaller_and_a_wrong_one_is_found(recording, truth, tmp_path):
     options = (MODEL, recording, "-o", tmp_path, "--truth", truth, "--no-video", "--track", "--motion", MOTION)
     assert invoke(*options, "--attitude", attitude_file(tmp_path / "good.csv", 0.004)).exit_code == 0

@@ -134,7 +134,8 @@ class Report:
             row += [*(_judgement_row(judgement) if self.truth else []), *self._tracked_row(instant_us, tracked, state)]
             self._rows.writerow(row)
         box, followed = estimate.box, tracked and tracked.box
-        self._history.add(Moment(start_us, start_us + self.step_us, estimate.state, box and box.lower, box and box.upper, state, followed))
+        best = estimate if tracked is None or followed is None else tracked
+        self._history.add(Moment(start_us, start_us + self.step_us, best.state, box and box.lower, box and box.upper, state, followed))
         shown = {"truth": state, "explanation": explanation, "title": f"{start_us / 1e6:.3f} s", "attitude": attitude}
         self._draw(number, frame, estimate, shown)
 
