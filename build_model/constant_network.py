@@ -10,14 +10,20 @@ from runtime.scene import Scene
 
 
 def constant_network(scene: Scene) -> onnx.GraphProto:
-    """A graph from float32 [1, 1, height, width] to float32 [1, 4], the centre of the scene's domain; nothing is trained."""
+    """A graph from uint8 [1, 1, height, width] to float32 [1, 4], the centre of the scene's domain, which looks at one pixel.
+
+    Nothing is trained.
+    """
     centre = ((scene.domain.lower + scene.domain.upper) / 2).astype(np.float32)
     nodes = [
-        helper.make_node("GlobalAveragePool", ["image"], ["mean"], name="mean"),
-        helper.make_node("Flatten", ["mean"], ["flat"], name="flat"),
-        helper.make_node("Gemm", ["flat", "weights", "centre"], ["state"], name="state"),
+        helper.make_node("Slice", ["image", "first", "second", "axes"], ["pixel"], name="pixel"),
+        helper.make_node("Flatten", ["pixel"], ["flat"], name="flat"),
+        helper.make_node("Cast", ["flat"], ["shade"], name="shade", to=TensorProto.FLOAT),
+        helper.make_node("Gemm", ["shade", "weights", "centre"], ["state"], name="state"),
     ]
     constants = [numpy_helper.from_array(np.zeros((1, 4), dtype=np.float32), "weights"), numpy_helper.from_array(centre, "centre")]
-    image = helper.make_tensor_value_info("image", TensorProto.FLOAT, [1, 1, *scene.camera.shape])
+    corners = {"first": [0, 0], "second": [1, 1], "axes": [2, 3]}
+    constants += [numpy_helper.from_array(np.array(values, dtype=np.int64), name) for name, values in corners.items()]
+    image = helper.make_tensor_value_info("image", TensorProto.UINT8, [1, 1, *scene.camera.shape])
     state = helper.make_tensor_value_info("state", TensorProto.FLOAT, [1, 4])
     return helper.make_graph(nodes, "constant", [image], [state], constants)
