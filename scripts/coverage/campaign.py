@@ -177,17 +177,18 @@ def main(
     replay_frame: Annotated[str | None, typer.Option("--replay", help='One frame again: "SCENARIO#NUMBER".')] = None,
 ) -> None:
     """Run every scenario, or what is left of an earlier run, and print the table."""
-    output.parent.mkdir(parents=True, exist_ok=True)
+    folder = output.with_suffix("")  # of derived models: two campaigns at once have one each
+    folder.mkdir(parents=True, exist_ok=True)
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     given = Estimator.load(model)
     chosen = list(scenarios(recording is not None, given.largest_missed_budget))
     if replay_frame is not None:
         scenario, number = named(replay_frame, chosen)
-        path = model if scenario.model == "given" else build_model(given.scene, scenario.model, output.parent, jobs)
+        path = model if scenario.model == "given" else build_model(given.scene, scenario.model, folder, jobs)
         sys.exit(int(replay(Chunk(scenario, str(path), None if recording is None else str(recording), seed, number, 1, "")) > 0))
     if only:
         chosen = [scenario_named(name, chosen) for name in dict.fromkeys(only)]
-    models = {"given": model} | derived_models(given.scene, {scenario.model for scenario in chosen}, output.parent, jobs)
+    models = {"given": model} | derived_models(given.scene, {scenario.model for scenario in chosen}, folder, jobs)
     chosen = [scenario for scenario in chosen if scenario.model in models and is_allowed(scenario, models[scenario.model])]
     chunks = chunks_of(models, chosen, frames, recording, seed)
     journal = Journal(output.with_suffix(".chunks.jsonl"), chunks)

@@ -85,7 +85,7 @@ def seen_through(scene: Scene, name: str) -> Scene:
 
 def build_model(scene: Scene, name: str, folder: Path, jobs: int) -> Path:
     """Writes one of `DERIVED` to `folder` and returns its path. The same scene and versions give the same file."""
-    path = folder / f"coverage-{name.replace(', ', '-').replace(' ', '-')}.onnx"
+    path = folder / f"{name.replace(', ', '-').replace(' ', '-')}.onnx"
     export_model(derived_scene(scene, name), path, jobs=jobs, estimator=NO_ESTIMATOR if name in LENSES else None)
     return path
 
