@@ -69,12 +69,12 @@ def scales_at_borders(sets: StateSet, sight: Sight, borders: Borders) -> Interva
         if mirrored.any():
             near, far = np.where(mirrored, -far, near), np.where(mirrored, -near, far)
             offset_low, offset_high = np.where(mirrored, -offset_high, offset_low), np.where(mirrored, -offset_low, offset_high)
-        if (near > 0).all():
-            np.maximum(low, offset_low / far, out=low)
-            np.minimum(high, offset_high / near, out=high)
-        elif (near > 0).any():
-            np.maximum(low, offset_low / far, out=low, where=near > 0)
-            np.minimum(high, offset_high / np.where(near > 0, near, 1.0), out=high, where=near > 0)
+        one_side = near > 0
+        if not one_side.all():
+            near, far = np.where(one_side, near, 1.0), np.where(one_side, far, 1.0)
+            offset_low, offset_high = np.where(one_side, offset_low, 0.0), np.where(one_side, offset_high, np.inf)
+        np.maximum(low, offset_low / far, out=low)
+        np.minimum(high, offset_high / near, out=high)
     if (sets.x[:, 0] < sets.x[:, 1]).any():
         x_m = sight.scene.runway.x_m
         for one, other in itertools.permutations(range(len(x_m)), 2):
