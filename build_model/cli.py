@@ -208,7 +208,7 @@ def import_camera(
     model: Annotated[str | None, typer.Option(help="The lens, where the file does not say: radial-tangential or fisheye.")] = None,
     size: Annotated[str | None, typer.Option(metavar="WIDTHxHEIGHT", help="The frame, where the file does not say.")] = None,
 ) -> None:
-    """Turn a camera's calibration file into the table [camera] of a scene."""
+    """Turn a camera's calibration file into a scene's table of its camera."""
     try:
         from build_model import import_camera as reader
     except ImportError as error:

@@ -108,7 +108,7 @@ class Motion:
     def __str__(self) -> str:
         names = ("theta {} to {} rad/s", "x {} to {} m/s", "y {} to {} m/s", "z {} to {} m/s")
         pairs = zip(names, self.rate_lower.tolist(), self.rate_upper.tolist(), strict=True)
-        return ", ".join(name.format(f"{low:g}", f"{high:g}") for name, low, high in pairs)
+        return ", ".join(name.format(f"{low + 0.0:g}", f"{high + 0.0:g}") for name, low, high in pairs)  # + 0.0: a rate of -0 is shown as 0
 
 
 def moved_box(lower: Floats, upper: Floats, by: Displacement) -> tuple[Floats, Floats]:
