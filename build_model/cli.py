@@ -98,7 +98,7 @@ def _planned(console: Console, path: Path, trained: bool, jobs: int, memory_mb: 
     may_take = free_memory_mb() if memory_mb is None else memory_mb
     try:
         scene = Scene.load(path)
-        size = build_size(Sensor.of(scene).ideal, jobs, trained)
+        size = build_size(Sensor.of(scene).ideal, jobs, trained, may_take)
         console.print(f"{path}: what it takes, estimated before anything is built", markup=False, highlight=False, soft_wrap=True)
         table = Table(show_header=False)
         for name, value in {**size.rows(), "memory that it may take": f"{may_take:.0f} MB"}.items():
