@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -100,8 +100,10 @@ def draw_estimate(
     `frame`: (height, width), lit where not 0. `mask`: S of `estimate.cell`, bool (height, width). `truth`: a state (4,). `explanation`:
     of an estimate without a box. Returns (height', `width`, 3); by default twice the frame's width, magnified until the text fits.
     `attitude`: of a rolled and yawed camera, as whose middle everything is drawn; its dark pixels are not. `over_time`: what a tracker
-    makes of the frame, whose box is outlined too, and has a line of its own.
+    makes of the frame, whose box is outlined too, and has a line of its own; the estimate is its.
     """
+    if over_time is not None and over_time.box is not None:
+        estimate = replace(estimate, state=over_time.state, used_fallback=over_time.used_fallback)
     scale = -(-NARROWEST_PICTURE // frame.shape[1]) if width is None else width / 2 / frame.shape[1]
     whole = View(0, 0, frame.shape, scale)
     close = runway_view(scene, estimate, truth, zoom, scale * zoom, explanation, attitude)
