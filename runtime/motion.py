@@ -32,7 +32,7 @@ Floats = NDArray[np.float64]
 US_PER_S = 1e6
 SHORTEST_US = 1e-6
 """What moves in a shorter time is bounded by what may move in up to this one: products of such times with rates have no digits left."""
-LATEST_US = 2**63
+LATEST_US = 2.0**63
 """Instants lie before this one, and after its negative: 300,000 years."""
 STEEPEST_RAD = 1.57
 """Where a pitch is taken for a right angle."""
