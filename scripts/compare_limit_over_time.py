@@ -148,7 +148,7 @@ class Compared:
         """A window; only those that count are shown, and all are checked."""
         within = np.zeros(len(histories.states), dtype=bool)
         if box is not None:
-            within = ((box.lower <= histories.states) & (histories.states <= box.upper)).all(axis=1)
+            within = np.logical_and.reduce((box.lower <= histories.states) & (histories.states <= box.upper), axis=1)
         self.states, self.outside = self.states + len(within), self.outside + int((~within).sum())
         if counts and box is not None:
             self.band.append(box.half_widths[FREE])
