@@ -205,9 +205,7 @@ def import_camera(
     calibration: Annotated[Path, typer.Argument(help="Calibration file of OpenCV, ROS, Kalibr or Metavision: YAML, XML or JSON.")],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Where to write the table; by default it is printed.")] = None,
     camera: Annotated[str | None, typer.Option(help="Which camera of a Kalibr chain: cam0, cam1, ...")] = None,
-    model: Annotated[
-        str | None, typer.Option(help="The lens, in place of what the file says, if it does: radial-tangential or fisheye.")
-    ] = None,
+    model: Annotated[str | None, typer.Option(help="The lens, in place of what the file says: radial-tangential or fisheye.")] = None,
     size: Annotated[str | None, typer.Option(metavar="WIDTHxHEIGHT", help="The frame, where the file does not say.")] = None,
 ) -> None:
     """Turn a camera's calibration file into a scene's table of its camera."""
