@@ -1,7 +1,8 @@
 """What a scene takes to build: boxes, entries, memory, seconds and the size of its file, told before anything is built.
 
 Boxes are counted. The rest is estimated from a sample, a few cells and a few of their entries, made as the build makes them, and from
-constants that were measured (below). So the estimate takes seconds, whatever the scene.
+constants that were measured (below). So the estimate takes seconds and no more memory than the bound that it tells, whatever the scene: of
+hundreds of markings, which make each cell dear, fewer cells and entries are sampled.
 """
 
 from __future__ import annotations
@@ -18,14 +19,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from build_model.calibration import check_calibration
+from build_model.enclosure import MARKINGS_AT_ONCE, in_parts
 from build_model.hough_bank import BATCH_BYTES, BYTES_A_ROW, CellBank, CellMasks, box_count, some_boxes
 from build_model.paper.paper_bound import paper_bound
 from build_model.partition import Partition, partition
 from build_model.pixel_mask import runs_of
 from build_model.run_table import mirrored
-from build_model.spatial_filter import spatial_window
+from build_model.spatial_filter import SLICES, spatial_window
 from build_model.window import Window
-from build_model.window_bank import CellWindows, cell_windows, group_count, halved_axes, sets_at_once
+from build_model.window_bank import CellWindows, cell_windows, group_boxes, group_count, halved_axes, sets_at_once, windowed_bank
 from runtime.scene import STATE_NAMES, Bank, Scene, SceneError
 
 MB = 1e6
@@ -37,10 +39,17 @@ COUNTED_BINS = 40_000
 """Bins of theta and z in all of these, or those of one cell."""
 SAMPLED_CELLS, SAMPLED_BOXES, SAMPLED_GROUPS = 8, 24, 200
 """Cells of which entries are made, and boxes of each, or groups in a bank of windows."""
+LOOKED_COLUMNS, SPANNED_COLUMNS, WINDOWED_COLUMNS = 2**26, 2**25, 2**22
+"""Columns of markings, a slice or a set each, that are bounded at most: for the window of all, S of sampled cells, and groups of one."""
+GROUPS_BYTES = 2**26
+"""What a cell's sampled groups may take."""
+BYTES_A_SPAN, PAPER_BYTES = 72, 9e6
+"""What a slice of a cell takes for each row of a marking while S is made, and what the paper's bound takes for each marking at once."""
 PROCESS_BYTES, WORKER_BYTES = 3.0e8, 1.5e8
 """What the command holds with torch and onnxruntime loaded, and what each further process does."""
-BYTES_A_RUN, BYTES_AN_ENTRY = 200, 600
-"""What the tables take in memory at most while they are laid out, for each vertical run of a mask and for each entry beside its runs."""
+BYTES_A_RUN, BYTES_A_PLACE, BYTES_AN_ENTRY = 200, 72, 600
+"""What the tables take in memory at most while they are laid out, for each vertical run of a mask, for each place of a window, and for each
+entry beside these."""
 SHARE_IN_WORKER = 0.5
 """What a worker holds and sends of the cell that it has built, over what that takes while the tables are laid out."""
 FILE_BYTES_AN_ENTRY, FILE_BYTES_A_CELL, FILE_BYTES = 116, 250, 20_000
@@ -112,24 +121,28 @@ class _Sample:
     box_seconds: float
 
 
-def build_size(scene: Scene, jobs: int = 1, trained: bool = True) -> BuildSize:
+def build_size(scene: Scene, jobs: int = 1, trained: bool = True, memory_mb: float = math.inf) -> BuildSize:
     """The estimate; `trained`: NN_e is trained too. The counts and bytes are the same every time, the seconds this machine's.
 
     Raises `SceneError` where the calibration or a sampled entry shows that the scene has no certificate, and `BuildTooLargeError` for too
-    many cells.
+    many cells, and where making windows at all takes more than `memory_mb`, so that none can be sampled.
     """
     if scene.domain.cell_count > MOST_CELLS:
         raise BuildTooLargeError(f"domain: found {scene.domain.cell_count} cells; give {MOST_CELLS} or fewer")
     cells = partition(scene)
     masks = isinstance(scene.bank, Bank)
+    if not masks and memory_mb * MB < (least := MARGIN * (PROCESS_BYTES + _windows_bytes(scene))):
+        raise BuildTooLargeError(_more_memory(memory_mb, least / MB))
     bins = scene.bank.pitch_bins * scene.bank.distance_bins if isinstance(scene.bank, Bank) else 1
     counted = np.unique(np.linspace(0, len(cells) - 1, max(1, min(COUNTED_CELLS, COUNTED_BINS // bins))).astype(int))
     count, parts = (box_count, 1) if masks else (group_count, 2 ** len(halved_axes(scene)))
     counts = parts * np.array([count(scene, cells.lower[cell], cells.upper[cell]) for cell in counted])
-    window = reduce(Window.union, (spatial_window(scene, cells.lower[cell], cells.upper[cell]) for cell in counted))
+    looked = counted[_spread(len(counted), max(2, LOOKED_COLUMNS // _spanned(scene)))]
+    window = reduce(Window.union, (spatial_window(scene, cells.lower[cell], cells.upper[cell]) for cell in looked))
     check_calibration(scene, window)
-    sample_of = _sample_of_masks if masks else _sample_of_windows
-    samples = [sample_of(scene, cells.lower[cell], cells.upper[cell], window) for cell in _drawn(counted, counts)]
+    sample_of, most = (_sample_of_masks, SAMPLED_CELLS) if masks else (_sample_of_windows, SPANNED_COLUMNS // _spanned(scene))
+    drawn = _drawn(counted, counts, min(max(2, most), SAMPLED_CELLS))
+    samples = [sample_of(scene, cells.lower[cell], cells.upper[cell], window) for cell in drawn]
 
     def per_box(name: str) -> float:
         return float(sum(getattr(sample, name) for sample in samples) / sum(sample.boxes for sample in samples))
@@ -142,7 +155,8 @@ def build_size(scene: Scene, jobs: int = 1, trained: bool = True) -> BuildSize:
     largest_cell = per_box("layout_bytes") * float(counts.max()) * SHARE_IN_WORKER
     processes = jobs * (max(sample.batch_bytes for sample in samples) + WORKER_BYTES * (jobs > 1))
     training = _training_bytes(scene, window) if trained else 0.0
-    stages = processes + jobs * largest_cell + SHARE_IN_WORKER * layout, layout, 6 * file_bytes, training
+    bounds = jobs * PAPER_BYTES * min(len(scene.runway.markings), MARKINGS_AT_ONCE)
+    stages = processes + jobs * largest_cell + SHARE_IN_WORKER * layout, layout, 6 * file_bytes + bounds, training
     return BuildSize(
         cells=len(cells),
         boxes=boxes,
@@ -156,10 +170,27 @@ def build_size(scene: Scene, jobs: int = 1, trained: bool = True) -> BuildSize:
     )
 
 
-def _drawn(counted: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Cells drawn by their numbers of boxes, so that a box of each kind is as likely as in the bank."""
+def _spread(count: int, most: int) -> NDArray[np.int64]:
+    """Places among `count` at equal distances, the first and the last among them: all, or `most`."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
+
+
+def _spanned(scene: Scene) -> int:
+    """Columns that S of a cell takes to bound."""
+    return SLICES * len(scene.runway.markings) * scene.camera.height
+
+
+def _windows_bytes(scene: Scene) -> float:
+    """In memory, while windows and S of a cell are made."""
+    markings, height = len(scene.runway.markings), scene.camera.height
+    at_once = sets_at_once(scene) * BYTES_A_ROW * height * (1 + markings)
+    return max(at_once, BYTES_A_SPAN * SLICES * height * min(markings, MARKINGS_AT_ONCE))
+
+
+def _drawn(counted: NDArray[np.int64], counts: NDArray[np.int64], cells: int) -> NDArray[np.int64]:
+    """So many cells, drawn by their numbers of boxes, so that a box of each kind is as likely as in the bank."""
     rng, ends = np.random.default_rng(0), np.cumsum(counts)
-    places = (np.arange(SAMPLED_CELLS) + rng.random(SAMPLED_CELLS)) / SAMPLED_CELLS * ends[-1]
+    places = (np.arange(cells) + rng.random(cells)) / cells * ends[-1]
     return counted[np.searchsorted(ends, places, "right").clip(0, len(counted) - 1)]
 
 
@@ -188,20 +219,22 @@ def _sample_of_masks(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np
 
 
 def _sample_of_windows(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64], window: Window) -> _Sample:
-    """Of the whole cell, or of a part of its theta if it has many groups."""
-    groups, part = group_count(scene, lower, upper), upper.copy()
-    part[0] = lower[0] + (upper[0] - lower[0]) * min(1.0, SAMPLED_GROUPS / groups)
+    """Of the whole cell, or of some of its groups if it has many, or if each takes much."""
+    markings, parts = len(scene.runway.markings), 2 ** len(halved_axes(scene))
+    places = windowed_bank(scene).rows * markings
+    most = min(WINDOWED_COLUMNS // (markings * scene.camera.height), GROUPS_BYTES // (BYTES_A_PLACE * places)) // (1 + parts)
+    boxes = group_boxes(scene, lower, upper)
+    boxes = boxes[np.sort(np.random.default_rng(0).permutation(len(boxes))[: max(1, min(SAMPLED_GROUPS, most))])]
     start = time.perf_counter()
-    bank = cell_windows(scene, lower, part)
-    seconds, parts = time.perf_counter() - start, bank.exists.shape[1]
-    places, markings = bank.windows.border.shape[1], len(scene.runway.markings)
+    bank = cell_windows(scene, lower, upper, boxes=boxes)
+    seconds = time.perf_counter() - start
     return _Sample(
-        boxes=parts * group_count(scene, lower, part),
+        boxes=parts * len(boxes),
         entries=len(bank),
         cell_bytes=4.0 * markings * window.shape[0],
         box_bytes=bank.exists.size * (5 * places + FILE_BYTES_AN_ENTRY) + len(bank.exists) * 8 * places,
-        layout_bytes=bank.exists.size * (72 * places + BYTES_AN_ENTRY),
-        batch_bytes=sets_at_once(scene) * BYTES_A_ROW * scene.camera.height * (1 + markings),
+        layout_bytes=bank.exists.size * (BYTES_A_PLACE * places + BYTES_AN_ENTRY),
+        batch_bytes=_windows_bytes(scene),
         cell_seconds=0.0,
         box_seconds=seconds,
     )
@@ -229,10 +262,12 @@ def _seconds(
         training = scene.estimator
         an_epoch = EPOCH_SECONDS * math.prod(window.shape) / PAPERS_WINDOW_PX
         seconds["NN_e"] = training.training_frames * (FRAME_SECONDS + training.epochs * an_epoch)
-    start = time.perf_counter()
+    start, seconds["file"] = time.perf_counter(), 0.0
     if (cells.lower < cells.upper).any():
-        paper_bound(scene, cells.lower[len(cells) // 2], cells.upper[len(cells) // 2])
-    seconds["file"] = (time.perf_counter() - start) * len(cells) / at_once
+        some = next(in_parts(scene))
+        paper_bound(some, cells.lower[len(cells) // 2], cells.upper[len(cells) // 2])
+        cells_like_it = len(cells) * len(scene.runway.markings) / len(some.runway.markings)
+        seconds["file"] = (time.perf_counter() - start) * cells_like_it / at_once
     return seconds
 
 
@@ -254,14 +289,18 @@ def check_size(scene: Scene, size: BuildSize, memory_mb: float) -> None:
         raise BuildTooLargeError(_advice(scene, size.memory_bytes / MB, memory_mb, size))
 
 
+def _more_memory(memory_mb: float, fixed_mb: float) -> str:
+    return (
+        f"--memory-mb: found {memory_mb:.0f}; give {math.ceil(FIXED_SHARE * fixed_mb)} or more, or fewer --jobs: processes alone take most"
+    )
+
+
 def _advice(scene: Scene, needed_mb: float, memory_mb: float, size: BuildSize) -> str:
     """What takes most: the processes, the training's frames, or the axis that is divided most finely."""
     takes = f"takes up to about {needed_mb:.0f} MB to build, more than the {memory_mb:.0f} MB of --memory-mb"
     fixed = size.of_processes / MB
     if memory_mb <= FIXED_SHARE * fixed:
-        return (
-            f"--memory-mb: found {memory_mb:.0f}; give {math.ceil(FIXED_SHARE * fixed)} or more, or fewer --jobs: processes alone take most"
-        )
+        return _more_memory(memory_mb, fixed)
     share = (memory_mb - fixed) / (needed_mb - fixed)
     if size.of_training == size.memory_bytes:
         frames = scene.estimator.training_frames
@@ -293,7 +332,7 @@ class Ledger:
             runs = sum(len(masks.mask) for masks in (bank.spatial, bank.must_light, bank.may_light))
             self._bytes += BYTES_A_RUN * runs + BYTES_AN_ENTRY * len(bank)
         else:
-            self._bytes += bank.exists.size * (72 * bank.windows.border.shape[1] + BYTES_AN_ENTRY)
+            self._bytes += bank.exists.size * (BYTES_A_PLACE * bank.windows.border.shape[1] + BYTES_AN_ENTRY)
         self._built, self._entries = self._built + 1, self._entries + len(bank)
         if self._bytes > self._memory_mb * MB:
             raise BuildTooLargeError(

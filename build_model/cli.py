@@ -98,7 +98,7 @@ def _planned(console: Console, path: Path, trained: bool, jobs: int, memory_mb: 
     may_take = free_memory_mb() if memory_mb is None else memory_mb
     try:
         scene = Scene.load(path)
-        size = build_size(Sensor.of(scene).ideal, jobs, trained)
+        size = build_size(Sensor.of(scene).ideal, jobs, trained, may_take)
         console.print(f"{path}: what it takes, estimated before anything is built", markup=False, highlight=False, soft_wrap=True)
         table = Table(show_header=False)
         for name, value in {**size.rows(), "memory that it may take": f"{may_take:.0f} MB"}.items():
@@ -205,10 +205,10 @@ def import_camera(
     calibration: Annotated[Path, typer.Argument(help="Calibration file of OpenCV, ROS, Kalibr or Metavision: YAML, XML or JSON.")],
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Where to write the table; by default it is printed.")] = None,
     camera: Annotated[str | None, typer.Option(help="Which camera of a Kalibr chain: cam0, cam1, ...")] = None,
-    model: Annotated[str | None, typer.Option(help="The lens, where the file does not say: radial-tangential or fisheye.")] = None,
+    model: Annotated[str | None, typer.Option(help="The lens, in place of what the file says: radial-tangential or fisheye.")] = None,
     size: Annotated[str | None, typer.Option(metavar="WIDTHxHEIGHT", help="The frame, where the file does not say.")] = None,
 ) -> None:
-    """Turn a camera's calibration file into the table [camera] of a scene."""
+    """Turn a camera's calibration file into a scene's table of its camera."""
     try:
         from build_model import import_camera as reader
     except ImportError as error:

@@ -5,15 +5,29 @@ The ranges behind them are `runtime.state_set`'s, exact closed forms; `runtime.r
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
 from runtime.rounding import above, below, first_crossed, first_touched, inverted, last_crossed, last_touched
-from runtime.scene import Camera, Scene
+from runtime.scene import Camera, Runway, Scene
 from runtime.state_set import Floats, StateSet, column_range, end_rows, fall, reach, scale_between, tangent_of_row
 
 Columns = tuple[NDArray[np.int64], NDArray[np.int64]]
 """First and last column a marking lights in a row, two arrays (sets, markings, rows); none where last < first."""
+
+
+MARKINGS_AT_ONCE = 8
+"""Markings of which something is computed at once: memory does not grow with their number."""
+
+
+def in_parts(scene: Scene) -> Iterator[Scene]:
+    """The scene with `MARKINGS_AT_ONCE` of its markings after the other."""
+    markings = scene.runway.markings
+    for first in range(0, len(markings), MARKINGS_AT_ONCE):
+        yield replace(scene, runway=Runway(markings[first : first + MARKINGS_AT_ONCE]))
 
 
 def _scale_at_distance(camera: Camera, theta: Floats, d: Floats, start: Floats, stop: Floats) -> tuple[Floats, Floats]:

@@ -155,7 +155,8 @@ def _camera_of_kalibr(name: str, table: dict[str, Any], wanted: Wanted) -> Camer
     size = _pair(f"{name}.resolution", table["resolution"]) if "resolution" in table else None
     model = wanted.model or table.get("distortion_model")
     coefficients = _numbers(f"{name}.distortion_coeffs", table.get("distortion_coeffs", []))
-    return _camera(size, (fu, fv, pu, pv), f"{name}.distortion_model", model, coefficients, wanted)
+    key = "--model" if wanted.model else f"{name}.distortion_model"
+    return _camera(size, (fu, fv, pu, pv), key, model, coefficients, wanted)
 
 
 def _camera_of_matrix(tables: dict[str, Any], wanted: Wanted) -> Camera:
@@ -172,7 +173,8 @@ def _camera_of_matrix(tables: dict[str, Any], wanted: Wanted) -> Camera:
     coefficients = [] if lens is None else _numbers(lens, tables[lens])
     _check_whole_frame(tables)
     model = wanted.model or _model_named(tables)
-    return _camera(_size(tables), (fx, fy, cx, cy), "distortion_model", model, coefficients, wanted)
+    key = "--model" if wanted.model else "distortion_model"
+    return _camera(_size(tables), (fx, fy, cx, cy), key, model, coefficients, wanted)
 
 
 def _model_named(tables: dict[str, Any]) -> str | None:

@@ -6,10 +6,12 @@ the slices, widened by the tolerance and clipped to the frame.
 
 from __future__ import annotations
 
+from functools import reduce
+
 import numpy as np
 from numpy.typing import NDArray
 
-from build_model.enclosure import Columns, columns_that_may_be_lit
+from build_model.enclosure import Columns, columns_that_may_be_lit, in_parts
 from build_model.partition import partition
 from build_model.pixel_mask import paint, widened, window_of
 from build_model.window import Bits, Window
@@ -60,20 +62,33 @@ def slice_cell(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float
 
 def spatial_filter(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> tuple[Bits, Window]:
     """S of the cell [lower, upper], both (4,): bits (rows, columns) in the window that is returned with them."""
-    columns = _spatial_columns(scene, lower, upper)
+    columns = _spatial_columns(scene, slice_cell(scene, lower, upper))
     window = window_of(columns)
     return np.logical_or.reduce(paint(columns, window), axis=0), window
 
 
 def spatial_window(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> Window:
     """The window of the cell's S, at a small part of what it costs to paint it."""
-    return window_of(_spatial_columns(scene, lower, upper))
+    slices = slice_cell(scene, lower, upper)
+    windows = [window_of(_spatial_columns(part, slices)) for part in in_parts(scene)]
+    return reduce(Window.union, [window for window in windows if window.bottom] or windows[:1])
 
 
-def _spatial_columns(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> Columns:
-    """The columns of S in each slice of the cell, a marking and a row."""
+def spatial_spans(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64]) -> Columns:
+    """First and last column of S that each marking can light in a row, (markings, height) each; none where last < first."""
+    slices = slice_cell(scene, lower, upper)
+    firsts, lasts = [], []
+    for part in in_parts(scene):
+        first, last = _spatial_columns(part, slices)
+        firsts.append(first.min(axis=0))
+        lasts.append(last.max(axis=0))
+    return np.concatenate(firsts), np.concatenate(lasts)
+
+
+def _spatial_columns(scene: Scene, slices: StateSet) -> Columns:
+    """The columns of S in each slice of a cell, a marking and a row."""
     line_px = scene.tolerance.line_px
-    return widened(scene, columns_that_may_be_lit(scene, slice_cell(scene, lower, upper), line_px), line_px)
+    return widened(scene, columns_that_may_be_lit(scene, slices, line_px), line_px)
 
 
 def spatial_filters(scene: Scene) -> Bits:

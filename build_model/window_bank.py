@@ -29,10 +29,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from build_model.enclosure import columns_at_borders, columns_that_may_be_lit
+from build_model.enclosure import columns_at_borders
 from build_model.line_boxes import HALVING_ORDER, HALVINGS, MOST_WEAK, LineBoxes
-from build_model.pixel_mask import widened
-from build_model.spatial_filter import FEW_CELLS, reference_row, slice_cell, sliced
+from build_model.spatial_filter import FEW_CELLS, reference_row, sliced, spatial_spans
 from build_model.window import Bits
 from runtime.camera import row_of_point
 from runtime.model.limits import SCALE_STEP, SMALLEST_LEVER_M
@@ -130,14 +129,18 @@ def windowed_bank(scene: Scene) -> WindowedBank:
     return scene.bank
 
 
-def cell_windows(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64], unseen: Bits | None = None) -> CellWindows:
+def cell_windows(
+    scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64], unseen: Bits | None = None, boxes: LineBoxes | None = None
+) -> CellWindows:
     """Groups, entries, windows and S of the cell [lower, upper], both (4,). Pixels lit in any frame, (height, width), are in no window.
+
+    `boxes`: of some of its `group_boxes` alone.
 
     A group that would pass on any frame, since it or one of its entries has no more windows than `missed_budget`, is halved until its
     parts are stronger. Raises `SceneError` where `HALVINGS` do not get there.
     """
     spans, missed = _spans(scene, lower, upper, unseen), scene.tolerance.missed_budget
-    parts = [_groups(scene, group_boxes(scene, lower, upper), lower, upper, spans)]
+    parts = [_groups(scene, group_boxes(scene, lower, upper) if boxes is None else boxes, lower, upper, spans)]
     for halving in range(HALVINGS):
         weak = parts[-1].weak(missed)
         if not 0 < weak.sum() <= MOST_WEAK:
@@ -351,9 +354,7 @@ def _apart(usable: Bits, first: Integers, last: Integers, order: Integers) -> Bi
 
 def _spans(scene: Scene, lower: NDArray[np.float64], upper: NDArray[np.float64], unseen: Bits | None) -> Spans:
     """S of the cell: in each row, all columns between the first and the last that some state's marking can light, and `line_px` more."""
-    line_px = scene.tolerance.line_px
-    first, last = widened(scene, columns_that_may_be_lit(scene, slice_cell(scene, lower, upper), line_px), line_px)
-    return Spans(first.min(axis=0), last.max(axis=0), unseen)
+    return Spans(*spatial_spans(scene, lower, upper), unseen)
 
 
 def _demand_strong(groups: _Groups, missed_budget: int) -> None:

@@ -21,6 +21,16 @@ def assumptions(scene: Scene) -> list[str]:
     return lines
 
 
+def told_turn(lines: list[str], scene: Scene) -> list[str]:
+    """A model's assumptions where roll, pitch and yaw are told frame by frame: in place of the first two, what holds of all frames."""
+    tolerance = scene.tolerance
+    return [
+        "The state lies in the scene's domain with the pitch that the ideal frame shows, atan(tan(theta)/cos(yaw)), in the place of theta.",
+        f"Roll and yaw as told, and the camera as in the scene, up to its [calibration] and {tolerance.line_px} px.",
+        *lines[2:],
+    ]
+
+
 def _turn_of(scene: Scene) -> str:
     """What is taken for granted of roll and yaw where no reference tells them."""
     if scene.attitude is None:

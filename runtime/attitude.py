@@ -29,6 +29,8 @@ from runtime.turn import arctangent, cosine_and_sine
 Floats = NDArray[np.float64]
 Interval = tuple[Floats, Floats]
 
+SMALLEST_RAD = 1e-100
+"""A smaller angle that is not 0 is taken for one between 0 and this: products of three such are no float64 with all its digits."""
 STEEPEST_SINE = 0.9999
 """Of a camera's pitch: one that looks farther down has no roll to speak of."""
 
@@ -75,12 +77,12 @@ class Attitude:
     @property
     def roll(self) -> tuple[float, float]:
         """The least and the largest roll, rad."""
-        return _around(self.roll_rad, self.roll_plus_minus_rad)
+        return _sized(_around(self.roll_rad, self.roll_plus_minus_rad))
 
     @property
     def yaw(self) -> tuple[float, float]:
         """The least and the largest yaw, rad."""
-        return _around(self.yaw_rad, self.yaw_plus_minus_rad)
+        return _sized(_around(self.yaw_rad, self.yaw_plus_minus_rad))
 
     def __str__(self) -> str:
         return f"roll {self.roll_rad:.6g} rad +-{self.roll_plus_minus_rad:.3g}, yaw {self.yaw_rad:.6g} rad +-{self.yaw_plus_minus_rad:.3g}"
@@ -97,8 +99,8 @@ def mounted(mount: Mount, roll: Angle, pitch_down: Angle, yaw: Angle) -> tuple[A
     """
     if mount == Mount():
         return Attitude.between(roll, yaw), pitch_down
-    of_mount = _rotation(*((angle, angle) for angle in (mount.roll_rad, mount.pitch_down_rad, mount.yaw_rad)))
-    whole = _times(of_mount, _rotation(roll, pitch_down, yaw))
+    of_mount = _rotation(*(_sized((angle, angle)) for angle in (mount.roll_rad, mount.pitch_down_rad, mount.yaw_rad)))
+    whole = _times(of_mount, _rotation(*map(_sized, (roll, pitch_down, yaw))))
     # the middle column is (-sin(phi) cos(theta), cos(phi) cos(theta), sin(theta)), the last row (cos(theta) sin(psi), sin(theta), ...)
     down = whole[2][1]
     if min(whole[1][1][0], whole[2][2][0]) <= 0 or max(-down[0], down[1]) >= STEEPEST_SINE:
@@ -154,6 +156,13 @@ def _angle_of(sine: Numbers, cosine: Numbers) -> Angle:
     tangents = [one / other for one in sine for other in cosine]
     low, high = (float(arctangent(np.array([extreme(tangents)]))[0]) for extreme in (min, max))
     return float(lowered(low, abs(low))), float(raised(high, abs(high)))
+
+
+def _sized(angle: Angle) -> Angle:
+    """The interval, with sides that are too small for products moved outward."""
+    low, high = angle
+    low = -SMALLEST_RAD if -SMALLEST_RAD < low < 0 else 0.0 if 0 < low < SMALLEST_RAD else low
+    return low, SMALLEST_RAD if 0 < high < SMALLEST_RAD else 0.0 if -SMALLEST_RAD < high < 0 else high
 
 
 def _around(value: float, plus_minus: float) -> tuple[float, float]:

@@ -32,7 +32,7 @@ Floats = NDArray[np.float64]
 US_PER_S = 1e6
 SHORTEST_US = 1e-6
 """What moves in a shorter time is bounded by what may move in up to this one: products of such times with rates have no digits left."""
-LATEST_US = 2**63
+LATEST_US = 2.0**63
 """Instants lie before this one, and after its negative: 300,000 years."""
 STEEPEST_RAD = 1.57
 """Where a pitch is taken for a right angle."""
@@ -108,7 +108,7 @@ class Motion:
     def __str__(self) -> str:
         names = ("theta {} to {} rad/s", "x {} to {} m/s", "y {} to {} m/s", "z {} to {} m/s")
         pairs = zip(names, self.rate_lower.tolist(), self.rate_upper.tolist(), strict=True)
-        return ", ".join(name.format(f"{low:g}", f"{high:g}") for name, low, high in pairs)
+        return ", ".join(name.format(f"{low + 0.0:g}", f"{high + 0.0:g}") for name, low, high in pairs)  # + 0.0: a rate of -0 is shown as 0
 
 
 def moved_box(lower: Floats, upper: Floats, by: Displacement) -> tuple[Floats, Floats]:

@@ -59,7 +59,8 @@ class Tracker:
         if horizon is not None and horizon < 1:
             raise ValueError(f"horizon: found {horizon}; give 1 frame or more, or None")
         if outliers < 0 or (outliers > 0 and (horizon is None or outliers >= horizon)):
-            raise ValueError(f"outliers: found {outliers} with a horizon of {horizon}; give 0, or fewer than the frames of a horizon")
+            lasts = "no horizon" if horizon is None else f"a horizon of {horizon}"
+            raise ValueError(f"outliers: found {outliers} with {lasts}; give 0, or fewer than the frames of a horizon")
         self.estimator, self.motion, self.horizon, self.outliers = estimator, bounds, horizon, outliers
         self._camera, self._domain = estimator.ideal.camera, estimator.domain
         self.late = 0

@@ -1,6 +1,6 @@
-"""Derives models/field.toml: markings, tolerance and missed budget for the simulated event camera.
+"""Derives markings, tolerance and missed budget for the simulated event camera: at the defaults, those of models/field.toml.
 
-    python scripts/derive_field.py [--scene models/paper.toml] [--flights 1] [--share 0.95] [-o models/field.toml]
+    python scripts/derive_field.py [--scene models/paper.toml] [--flights 1] [--seconds 52.8] [--share 0.95] [-o out/field.toml]
 
 The box is as wide as the frame leaves room for: a marking may lie wherever lit pixels reach. The paper's runway is 27 px either side of its
 middle and 35 rows long, and pitch and altitude compensate each other: lines of one pixel give half-widths of 0.015 rad and 0.027 m, while
@@ -47,7 +47,7 @@ from runtime.errors import fail
 from runtime.frames import FrameStream
 from runtime.image import dilated, runway_image
 from runtime.scene import Bank, Marking, Runway, Tolerance
-from runtime.whole_file import write_whole
+from runtime.whole_file import OutputError, write_whole, writing
 
 FIRST_SEED = 1000
 TOLERANCES_PX = (0, 1, 2)
@@ -183,17 +183,18 @@ def main(
     flights: Annotated[int, typer.Option(min=1, help="Simulated flights.")] = 1,
     seconds: Annotated[float, typer.Option(min=0.08, help="Length of each.")] = PAPER_SECONDS,
     share: Annotated[float, typer.Option(min=0.0, max=1.0, help="Share of the windows whose assumptions shall hold.")] = 0.95,
-    output: Annotated[Path, typer.Option("-o", "--output", help="Scene file to write.")] = Path("models/field.toml"),
+    output: Annotated[Path, typer.Option("-o", "--output", help="Scene file to write.")] = Path("out/field.toml"),
 ) -> None:
     """Derive markings, tolerance and missed budget from simulated flights and write the scene file."""
     console = terminal.console(130)
     try:
         text = derive(Scene.load(scene), flights, seconds, share, console)
-    except (SceneError, ValueError, OSError) as error:
+        if text is None:
+            fail("no tolerance of 0 to 2 px leaves every entry of the bank a pixel more than the budget; lower --share")
+        with writing(output):
+            write_whole(output, text.encode())
+    except (SceneError, ValueError, OutputError, OSError) as error:
         fail(error)
-    if text is None:
-        fail("no tolerance of 0 to 2 px leaves every entry of the bank a pixel more than the budget; lower --share")
-    write_whole(output, text.encode())
     console.print(f"written: {output}", markup=False)
 
 

@@ -11,6 +11,7 @@ beside the tracked one. Every box is asserted to hold its state.
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -21,7 +22,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from runtime import Box, Estimate, Estimator, Motion, Tracker, terminal
+from runtime import Box, Estimate, Estimator, Motion, Scene, Tracker, terminal
 from runtime.errors import fail
 from runtime.image import runway_image
 from runtime.model.format import ModelError
@@ -80,9 +81,8 @@ def tracked(
     estimator, rng = Estimator.load(path, missed_budget=budget), np.random.default_rng([seed, budget, missed])
     alone, followed, ratios = [], [], []
     for _ in track(range(flights), f"m = {budget}, {missed} missed", console=console, transient=True):
-        tracker, state = Tracker(estimator, Motion(-RATES, RATES)), estimator.scene.domain.uniform(rng, 1)[0]
-        rate, before = rng.uniform(-RATES, RATES), state
-        for number in range(FLIGHT_FRAMES):
+        tracker = Tracker(estimator, Motion(-RATES, RATES))
+        for number, (state, before) in enumerate(flown(estimator.scene, rng)):
             frame = seen(estimator, state, missed, clutter, rng)
             begun = time.thread_time()
             told = None if plus_minus is None else displacement(state - before, plus_minus * (FRAME_US / 1e6), rng)
@@ -93,11 +93,19 @@ def tracked(
                 alone.append(by_itself)
                 followed.append(over_time)
                 ratios.append((between - begun) / (time.thread_time() - between))
-            rate, before = rng.uniform(-RATES, RATES) if rng.random() < 0.1 else rate, state
-            after = state + rate * (1 - 1e-9) * FRAME_US / 1e6
-            outside = estimator.scene.domain.nearest(after) != after
-            rate, state = np.where(outside, -rate, rate), np.where(outside, state, after)
     return np.median(alone, axis=0), np.median(followed, axis=0), float(np.median(ratios))
+
+
+def flown(scene: Scene, rng: np.random.Generator) -> Iterator[tuple[Floats, Floats]]:
+    """The states of a flight, `FRAME_US` apart, each with the one before it: at rates within bounds that are drawn anew now and then."""
+    state = scene.domain.uniform(rng, 1)[0]
+    rate, before = rng.uniform(-RATES, RATES), state
+    for _ in range(FLIGHT_FRAMES):
+        yield state, before
+        rate, before = rng.uniform(-RATES, RATES) if rng.random() < 0.1 else rate, state
+        after = state + rate * (1 - 1e-9) * FRAME_US / 1e6
+        outside = scene.domain.nearest(after) != after
+        rate, state = np.where(outside, -rate, rate), np.where(outside, state, after)
 
 
 def displacement(moved: Floats, plus_minus: Floats, rng: np.random.Generator) -> dict[str, tuple[float, float]]:

@@ -101,7 +101,7 @@ def run(replay: Replay, estimator: Estimator, stream: FrameStream) -> None:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
     lost = f"{stream.late_events} late, {stream.unsorted_events} unsorted, {stream.outside_events} outside the sensor"
-    print(f"events: {lost}, {stream.misdated_events} misdated; {stream.runs} runs of the clock")
+    print(f"events: {lost}, {stream.misdated_events} misdated; {stream.runs} {'run' if stream.runs == 1 else 'runs'} of the clock")
 
 
 def main(

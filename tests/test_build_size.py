@@ -8,9 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scenes import AIRPORT, ONE_CELL, PAPER, STRIP
 
-from build_model import hough_bank
+from build_model import build_size as build_size_module
+from build_model import enclosure, hough_bank
 from build_model.assembly import assemble
 from build_model.build_size import (
     BYTES_A_RUN,
@@ -25,12 +27,14 @@ from build_model.build_size import (
 )
 from build_model.export import build_banks, export_model
 from build_model.hough_bank import CellBank, box_count, cell_bank, line_boxes, some_boxes
+from build_model.line_boxes import LineBoxes
+from build_model.paper.paper_bound import paper_bound
 from build_model.partition import partition
-from build_model.spatial_filter import spatial_filter, spatial_window
-from build_model.window_bank import group_boxes, group_count
+from build_model.spatial_filter import spatial_filter, spatial_spans, spatial_window
+from build_model.window_bank import CellWindows, cell_windows, group_boxes, group_count
 from runtime import Scene, SceneError
 from runtime.domain import Axis, Edges, Glide, Growth
-from runtime.scene import Bank, Calibration, Tolerance, WindowedBank
+from runtime.scene import Bank, Calibration, Marking, Runway, Tolerance, WindowedBank
 
 WIDE = replace(AIRPORT, domain=replace(AIRPORT.domain, x_m=Axis((0.0,), 60.0)))
 """The bank of masks that a slice of a real approach takes is too large for most machines."""
@@ -206,6 +210,56 @@ def test_a_window_is_known_without_painting(name: str) -> None:
     scene = SCENES[name]
     cells = partition(scene)
     assert spatial_window(scene, cells.lower[0], cells.upper[0]) == spatial_filter(scene, cells.lower[0], cells.upper[0])[1]
+
+
+def crowded(scene: Scene, markings: int) -> Scene:
+    """The scene with so many markings between its edges, in one cell."""
+    x_m, first = scene.runway.x_m, scene.runway.markings[0]
+    across = np.linspace(x_m.min(), x_m.max(), markings)
+    runway = Runway(tuple(Marking(f"m{number}", float(x), first.start_z_m, first.length_m) for number, x in enumerate(across)))
+    domain = replace(scene.domain, theta_rad=Axis((0.02,), 0.03) if scene.bank == WindowedBank() else Axis((0.6,), 0.1))
+    return replace(scene, runway=runway, domain=domain)
+
+
+def test_a_sample_of_many_markings_keeps_to_the_memory_that_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Made whole, the cell takes more than that; what is sampled, and its time, does not grow with the markings."""
+    made: list[int] = []
+
+    def counted(scene: Scene, *sides: NDArray[np.float64], boxes: LineBoxes) -> CellWindows:
+        made.append(len(boxes) * len(scene.runway.markings))
+        return cell_windows(scene, *sides, boxes=boxes)
+
+    monkeypatch.setattr(build_size_module, "cell_windows", counted)
+    monkeypatch.setattr(build_size_module, "WINDOWED_COLUMNS", 2**20)
+    monkeypatch.setattr(build_size_module, "SPANNED_COLUMNS", 2**22)
+    whole = crowded(SCENES["windows"], 160)
+    scene = replace(whole, bank=WindowedBank(set_px=8.0), domain=replace(whole.domain, z_m=Axis((950.0,), 50.0)))
+    tracemalloc.start()
+    size = build_size(scene, trained=False)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < size.memory_bytes / 4
+    assert size.boxes > 5 * 8 * sum(made) / 160
+    assert 0 < 9 * scene.camera.height * max(made) <= 2**20
+    assert len(made) == 2
+
+    monkeypatch.setattr(build_size_module, "cell_windows", None)
+    with pytest.raises(BuildTooLargeError, match=r"^--memory-mb: found 200; give \d+ or more"):
+        build_size(scene, trained=False, memory_mb=200)
+
+
+@pytest.mark.parametrize("name", ["paper", "windows"])
+def test_markings_are_taken_in_parts_without_a_difference(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = crowded(SCENES[name], 20)
+    cells = partition(scene)
+    sides, found = (cells.lower[0], cells.upper[0]), []
+    for at_once in (8, 20):
+        monkeypatch.setattr(enclosure, "MARKINGS_AT_ONCE", at_once)
+        found.append((spatial_window(scene, *sides), *spatial_spans(scene, *sides), paper_bound(scene, *sides)))
+    for one, other in zip(*found, strict=True):
+        assert np.array_equal(one, other) if isinstance(one, np.ndarray) else one == other
+    assert found[0][0] == spatial_filter(scene, *sides)[1]
+    assert (found[0][-1] is None) == (name == "windows")
 
 
 def test_some_memory_is_free() -> None:

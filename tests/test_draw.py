@@ -219,6 +219,22 @@ def test_a_frame_without_a_certificate_shows_the_nearest_state_and_its_dark_pixe
     assert near_colour(known, draw.TRUTH).any()
 
 
+def test_what_is_certified_over_time_is_outlined_and_has_a_line():
+    image = runway_image(SCENE, TRUTH)
+    estimate, pale = estimate_of(BOX, image), draw.OVER_TIME
+    narrow = estimate_of(Box(*(TRUTH + sign * (BOX.upper - BOX.lower) / 8 for sign in (-1, 1))), image)
+    alone = draw.draw_estimate(SCENE, image, estimate)
+    picture = draw.draw_estimate(SCENE, image, estimate, over_time=narrow)
+    assert picture.shape[0] == alone.shape[0] + draw.LINE_HEIGHT
+    strip = picture[alone.shape[0] - draw.TEXT_LINES * draw.LINE_HEIGHT :]
+    assert near_colour(strip, pale).any()
+    assert near_colour(picture[: -len(strip), picture.shape[1] // 2 :], pale).any()
+    assert not near_colour(alone, pale).any()
+    lost = draw.draw_estimate(SCENE, image, estimate, over_time=replace(narrow, outcome=Outcome.INCONSISTENT, box=None, state=None))
+    assert lost.shape == picture.shape
+    assert near_colour(lost, draw.NO_RUNWAY).any()
+
+
 def test_a_smaller_picture_shows_the_same_light():
     frame = np.zeros((480, 640), dtype=np.uint8)
     frame[300:400, 40:240] = 1

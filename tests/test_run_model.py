@@ -644,7 +644,7 @@ def test_ways_to_follow_a_recording_are_compared(recording, truth, tmp_path):
         (["--motion", MOTION], f"--motion: found {MOTION} without --track; add --track, or leave it out"),
         (["--track", "--motion", "1,2"], "--motion: found '1,2'; give four numbers from 0 on, as 0.1,0,0.3,1 (rad/s and m/s)"),
         (["--track", "--motion", "-1,0,0,0"], "--motion: found '-1,0,0,0'; give four numbers from 0 on, as 0.1,0,0.3,1 (rad/s and m/s)"),
-        (["--track", "--motion", MOTION, "--outliers", "1"], "--outliers: found 1 with a horizon of None; give 0, or fewer than "),
+        (["--track", "--motion", MOTION, "--outliers", "1"], "--outliers: found 1 with no horizon; give 0, or fewer than "),
         (["--track", "--motion", MOTION, "--horizon", "0"], "--horizon: found 0; give 1 frame or more, or None"),
     ],
 )
@@ -700,7 +700,11 @@ def test_a_recording_of_a_camera_that_rolls_and_yaws_is_certified_with_its_attit
     found = rows_of(tmp_path / "out")
     assert [(row["outcome"], row["tracked_outcome"], row["tracked_truth_inside"]) for row in found] == [("certified", "certified", "1")] * 3
     assert {row["assumptions_hold"] for row in found} == {""}
-    assert "Between two readings roll moves by 0 to 0 rad/s" in " ".join(done.stdout.split())
+    said = " ".join(done.stdout.split())
+    assert "Between two readings roll moves by 0 to 0 rad/s" in said
+    assert "Roll and yaw as told, and the camera as in the scene" in said
+    assert "No roll or yaw" not in said
+    assert "not told: of a camera that rolls or yaws" in said
     assert invoke(*options, "--attitude", tmp_path / "a.csv", "--pitch-alone").exit_code == 0
     assert "certified" not in {row["tracked_outcome"] for row in rows_of(tmp_path / "out")}
 

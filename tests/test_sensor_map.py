@@ -94,7 +94,8 @@ def test_corners_are_where_opencv_undistorts_them(k1: float) -> None:
     back = np.array([[ideal.focal_u_px, 0, ideal.u0 - 0.5], [0, ideal.focal_v_px, ideal.v0 - 0.5], [0, 0, 1]])
     points = np.stack([columns, rows], axis=-1)[:, None] - 0.5
     assert camera.distortion is not None
-    found = cv2.undistortPoints(points, matrix, np.array(camera.distortion.coefficients), None, None, back, (3, 500, 1e-15))
+    iterated = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)  # OpenCV 4 has it under a name of its own
+    found = iterated(points, matrix, np.array(camera.distortion.coefficients), R=None, P=back, criteria=(3, 500, 1e-15))
     for interval, expected in zip(sensor.corners(rows, columns), np.asarray(found).reshape(-1, 2).T + 0.5, strict=True):
         assert np.abs((interval[0] + interval[1]) / 2 - expected).max() < 0.001
         assert (interval[1] - interval[0]).max() < 1e-8

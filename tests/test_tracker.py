@@ -319,7 +319,7 @@ def test_a_horizon_of_one_forgets_after_a_contradiction_too(paper: Estimator) ->
     ("arguments", "message"),
     [
         ({"horizon": 0}, r"horizon: found 0; give 1 frame or more, or None"),
-        ({"outliers": 1}, r"outliers: found 1 with a horizon of None; give 0, or fewer than the frames of a horizon"),
+        ({"outliers": 1}, r"outliers: found 1 with no horizon; give 0, or fewer than the frames of a horizon"),
         ({"horizon": 3, "outliers": 3}, r"outliers: found 3 with a horizon of 3; give 0, or fewer than the frames of a horizon"),
         ({"horizon": 3, "outliers": -1}, r"outliers: found -1 with a horizon of 3; .*"),
         ({"motion": None}, r"motion: none is given and the model's scene has no \[motion\]; give Motion\(rate_lower, rate_upper\)"),

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from build_model.enclosure import in_parts
 from build_model.paper.method import Method
 from build_model.paper.projection_bounds import projection_jacobian, zeta_bounds
 from runtime.refine.interval import Floats, Interval
@@ -60,11 +61,16 @@ def paper_bound(scene: Scene, lower: ArrayLike, upper: ArrayLike) -> PaperBound 
     for a box of one state.
     """
     low, high = np.asarray(lower, dtype=np.float64), np.asarray(upper, dtype=np.float64)
-    zeta_low, zeta_high = zeta_bounds(scene, low, high, Method.CLOSED_FORM)
-    half_extent_px = above((zeta_high - zeta_low).max(axis=-1) / 2)
-    constants = _inverse_lipschitz_per_px(scene, low, high)
-    bounds = [PaperBound(float(delta), L) for delta, L in zip(half_extent_px, constants, strict=True) if L is not None]
+    bounds = [bound for part in in_parts(scene) for bound in _of_markings(part, low, high)]
     return min(bounds, key=lambda bound: bound.state_error, default=None)
+
+
+def _of_markings(scene: Scene, lower: Floats, upper: Floats) -> list[PaperBound]:
+    """The bounds of all markings that have one."""
+    zeta_low, zeta_high = zeta_bounds(scene, lower, upper, Method.CLOSED_FORM)
+    half_extent_px = above((zeta_high - zeta_low).max(axis=-1) / 2)
+    constants = _inverse_lipschitz_per_px(scene, lower, upper)
+    return [PaperBound(float(delta), L) for delta, L in zip(half_extent_px, constants, strict=True) if L is not None]
 
 
 def _inverse_lipschitz_per_px(scene: Scene, lower: Floats, upper: Floats) -> list[float | None]:

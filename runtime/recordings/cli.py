@@ -96,7 +96,9 @@ def run_model(
         _demand_track(track, {"--motion": motion, **files, "--horizon": horizon, "--outliers": outliers or None})
         packets = _nonempty(recording, read_events(recording, estimator.scene.camera.shape, notes))
         inputs = [path for path in (model, recording, truth, attitude, gyroscope) if path is not None]
-        with Report(folder, estimator, stream.window_us, stream.step_us, known, video=video, tracked=track, inputs=inputs) as report:
+        turned = follower is not None and follower.turned
+        kinds = {"video": video, "tracked": track, "turned": turned}
+        with Report(folder, estimator, stream.window_us, stream.step_us, known, inputs=inputs, **kinds) as report:
             fault, code = _estimated(console, stream, packets, report, refine, follower)
             noted = noted_of(stream, notes)
             source = {"model": str(model), "sha256": estimator.sha256, "recording": str(recording), "fault": fault}
@@ -108,12 +110,12 @@ def run_model(
         fail(f"{recording}: cannot be read ({error.strerror or error}); give the path of a recording that can")
     except KeyboardInterrupt:
         fail(f"{folder}: interrupted before or after the windows; nothing is written, earlier files are untouched", INTERRUPTED)
-    _print_summary(console, folder, summary)
+    level = estimator.attitude is None and not turned
+    _print_summary(console, folder, summary, truth is not None and not level)
     for line in lines_of(noted):
         complain(f"{recording}: {line}")
     if fault:
         fail(f"{fault}; {summary['windows']} windows are written to {folder}", code)
-    level = estimator.attitude is None and (follower is None or not follower.turned)
     if truth is not None and known is not None and level and "assumptions_hold" not in summary:
         fail(_unmatched(truth, known, summary))
 
@@ -186,7 +188,8 @@ def _estimate_all(
             bar.update(task, advance=1, seconds=seconds)
 
 
-def _print_summary(console: Console, folder: Path, summary: dict[str, Any]) -> None:
+def _print_summary(console: Console, folder: Path, summary: dict[str, Any], unjudged: bool) -> None:
+    """`unjudged`: a truth is given that cannot tell which windows keep the assumptions."""
     table = Table(title=str(folder), title_justify="left", show_header=False)
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
@@ -203,6 +206,7 @@ def _print_summary(console: Console, folder: Path, summary: dict[str, Any]) -> N
         "ms a window, mean / largest": "{mean:.2f} / {largest:.2f}".format(**summary["milliseconds_a_window"]),
     }
     rows |= _tracked(summary.get("tracked"))
+    rows |= {"assumptions hold": "not told: of a camera that rolls or yaws the truth tells no pixels"} if unjudged else {}
     for kind, name in (("assumptions_hold", "assumptions hold"), ("assumptions_broken", "assumptions broken")):
         if kind in summary:
             rows |= _judged(name, summary[kind])
@@ -296,7 +300,7 @@ def _latency_table(rows: Sequence[Latency]) -> Table:
     table = Table("method", "p50 ms", "p99 ms", "max ms", "p99/p50", f"/ {REFERENCE}", title=rows[0].frames, title_justify="left")
     for row in rows:
         figures = (row.p50_ms, row.p99_ms, row.max_ms)
-        spread, ratio = f"{row.p99_ms / row.p50_ms:.2f}", f"{row.ratio:.3f} = 1/{1 / row.ratio:.1f}"
+        spread, ratio = f"{row.p99_ms / row.p50_ms:.2f}", f"{row.ratio:.3f}" + (f" = 1/{1 / row.ratio:.1f}" if row.ratio < 1 else "")
         table.add_row(row.method, *(f"{figure:.3f}" for figure in figures), spread, ratio)
     return table
 

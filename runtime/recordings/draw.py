@@ -6,6 +6,7 @@
 | blue | the spatial mask S of the named cell |
 | green | filtered pixels: the frame within the masks of the passing cells |
 | amber, translucent | the certified box, projected into the image |
+| pale amber line | the box that is certified over time, where a tracker follows |
 | magenta line | the markings of the estimated state |
 | cyan line | where nothing is certified: the markings of the nearest state, of which nothing is certified |
 | red pixels | dark ones of the true state's runway, or of the nearest state's where the truth is not known |
@@ -18,7 +19,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -37,7 +38,7 @@ Colour = tuple[int, int, int]
 
 BACKGROUND, TEXT, FRAME, FRAME_BORDER = (24, 22, 20), (225, 225, 225), (150, 150, 150), (90, 90, 90)
 MASK, MASK_TEXT, FILTERED, BOX, STATE, TRUTH = (140, 60, 20), (230, 140, 70), (90, 215, 70), (0, 170, 255), (255, 60, 255), (255, 255, 255)
-CERTIFIED, NO_RUNWAY, NEAREST = (90, 215, 70), (80, 80, 255), (255, 230, 90)
+CERTIFIED, NO_RUNWAY, NEAREST, OVER_TIME = (90, 215, 70), (80, 80, 255), (255, 230, 90), (115, 200, 250)
 PIXELS = np.array([BACKGROUND, MASK, FRAME, FILTERED, NO_RUNWAY], dtype=np.uint8)
 """Colours of pixels: dark, dark in S, lit, lit and filtered, dark in the runway."""
 BOX_LIGHT = 0.16
@@ -92,19 +93,25 @@ def draw_estimate(
     zoom: int = 5,
     width: int | None = None,
     attitude: Attitude | None = None,
+    over_time: Estimate | None = None,
 ) -> Picture:
     """The whole frame, beside it the runway at most `zoom` times larger, and below them the outcome in numbers with a legend.
 
     `frame`: (height, width), lit where not 0. `mask`: S of `estimate.cell`, bool (height, width). `truth`: a state (4,). `explanation`:
     of an estimate without a box. Returns (height', `width`, 3); by default twice the frame's width, magnified until the text fits.
-    `attitude`: of a rolled and yawed camera, as whose middle everything is drawn; its dark pixels are not.
+    `attitude`: of a rolled and yawed camera, as whose middle everything is drawn; its dark pixels are not. `over_time`: what a tracker
+    makes of the frame, whose box is outlined too, and has a line of its own; the estimate is its.
     """
+    if over_time is not None and over_time.box is not None:
+        estimate = replace(estimate, state=over_time.state, used_fallback=over_time.used_fallback)
     scale = -(-NARROWEST_PICTURE // frame.shape[1]) if width is None else width / 2 / frame.shape[1]
     whole = View(0, 0, frame.shape, scale)
     close = runway_view(scene, estimate, truth, zoom, scale * zoom, explanation, attitude)
     dark = _dark(scene, frame, truth, explanation) if attitude is None else None
     panels = [_magnified(_pixels(frame, estimate.filtered, mask, dark), view) for view in (whole, close)]
     _outline(panels[0], whole, close)
+    if over_time is not None and over_time.box is not None:
+        cv2.polylines(panels[1], _hulls(scene, close, over_time.box, attitude), True, OVER_TIME, 1, cv2.LINE_AA, FRACTION_BITS)
     _draw_states(panels[1], scene, close, estimate, truth, explanation, attitude)
     height, half = whole.size
     beside = _canvas(height, 2 * half)
@@ -112,7 +119,7 @@ def draw_estimate(
         beside[: panel.shape[0], left : left + panel.shape[1]] = panel
     beside[:, half] = FRAME_BORDER
     shown = mask is not None, dark is not None
-    return np.concatenate([beside, _text_strip(scene, estimate, truth, explanation, title, shown, beside.shape[1])])
+    return np.concatenate([beside, _text_strip(scene, estimate, truth, explanation, title, shown, beside.shape[1], over_time)])
 
 
 def draw_runway(
@@ -285,7 +292,7 @@ def _draw_states(
 ) -> None:
     """The box as a translucent band, then the markings of the nearest state, of the truth and of the estimate."""
     if estimate.box is not None:
-        hulls = [cv2.convexHull(view.points(points)) for points in box_outlines(scene, estimate.box, attitude) if len(points)]
+        hulls = _hulls(scene, view, estimate.box, attitude)
         filled = np.zeros_like(panel)
         for hull in hulls:
             cv2.fillPoly(filled, [hull], BOX, cv2.LINE_AA, FRACTION_BITS)
@@ -300,6 +307,11 @@ def _draw_states(
             cv2.polylines(panel, list(view.points(_seen(scene, state, attitude))), False, colour, 1, cv2.LINE_AA, FRACTION_BITS)
 
 
+def _hulls(scene: Scene, view: View, box: Box, attitude: Attitude | None) -> list[Any]:
+    """The box as OpenCV's polygons, one for each marking that the camera shows something of."""
+    return [cv2.convexHull(view.points(points)) for points in box_outlines(scene, box, attitude) if len(points)]
+
+
 def _text_strip(
     scene: Scene,
     estimate: Estimate,
@@ -308,10 +320,11 @@ def _text_strip(
     title: str,
     shown: tuple[bool, bool],
     width: int,
+    over_time: Estimate | None,
 ) -> Picture:
     """Lines of text; `shown`: whether a mask and the runway's dark pixels are."""
     size = min(1.0, width / (2 * NARROWEST_PICTURE))
-    strip = _canvas(TEXT_LINES * int(LINE_HEIGHT * size), width)
+    strip = _canvas((TEXT_LINES + (over_time is not None)) * int(LINE_HEIGHT * size), width)
     fallback = "estimate: box centre, as NN_e's state lies outside" if estimate.used_fallback else ""
     boundary = "box reaches the domain's face" if estimate.touches_boundary else ""
     lines = [[(title, TEXT), _outcome(estimate), (_cells(scene, estimate), TEXT), (fallback, TEXT), (boundary, TEXT)], [], [], []]
@@ -322,8 +335,11 @@ def _text_strip(
         lines[2] = [("nearest, not certified", NEAREST), *((text, TEXT) for text in _numbers(explanation.nearest.state))]
     if estimate.state is not None:
         lines[2] = [("estimate", STATE), *((text, TEXT) for text in _numbers(estimate.state))]
+    if over_time is not None:
+        ranges = [] if over_time.box is None else _ranges(over_time.box)
+        lines.insert(2, [("over time", OVER_TIME), _outcome(over_time), *((text, TEXT) for text in ranges)])
     if truth is not None:
-        lines[3] = [("truth", TRUTH), *((text, TEXT) for text in _numbers(np.asarray(truth)))]
+        lines[-1] = [("truth", TRUTH), *((text, TEXT) for text in _numbers(np.asarray(truth)))]
     mask, dark = (text if shows else "" for text, shows in zip((f"S of cell {estimate.cell}", "runway, dark"), shown, strict=True))
     lines.append([("lit", FRAME), ("filtered", FILTERED), (mask, MASK_TEXT), (dark, NO_RUNWAY)])
     for line, parts in enumerate(lines):

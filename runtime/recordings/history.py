@@ -1,7 +1,7 @@
 """States against time: what a history keeps of a recording of any length, and its chart.
 
 The chart has the colours of `runtime.recordings.draw`: amber for the certified bands, magenta for the estimate, white for the truth, red
-for times at which nothing is certified.
+for times at which nothing is certified. With a tracker the estimate is the one over time.
 """
 
 from __future__ import annotations
@@ -36,7 +36,10 @@ MARK_HEIGHT = 0.05
 
 @dataclass(frozen=True)
 class Moment:
-    """What is known of the time from `start_us` to `stop_us`: estimate, certified bounds and truth, (4,) each or None."""
+    """What is known of the time from `start_us` to `stop_us`: estimate, certified bounds and truth, (4,) each or None.
+
+    The bounds are those of the frame alone; the estimate is the best there is: with `tracked`, that over time.
+    """
 
     start_us: float
     stop_us: float

@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.assumptions import told_turn
 from runtime.attitude import Attitude
 from runtime.estimate import Estimate
 from runtime.estimator import Estimator
@@ -64,7 +65,8 @@ MOST_PICTURES = 12
 class Report:
     """Takes windows with `add` and writes the files above; `close` finishes them. As a context it leaves nothing half-written behind.
 
-    `inputs`: files that are being read. Raises `runtime.whole_file.OutputError` where a file cannot be written.
+    `turned`: roll and yaw are told of every window. `inputs`: files that are being read. Raises `runtime.whole_file.OutputError` where a
+    file cannot be written.
     """
 
     def __init__(
@@ -77,11 +79,13 @@ class Report:
         *,
         video: bool,
         tracked: bool = False,
+        turned: bool = False,
         inputs: Iterable[Path] = (),
     ) -> None:
         self.folder, self.estimator, self.window_us, self.step_us, self.truth = folder, estimator, window_us, step_us, truth
         self.instant_us = window_us * estimator.scene.instant_share
         """From the start of a window to the instant that its certificate speaks of."""
+        self._turned = turned
         self._tracked_columns = [*TRACKED_COLUMNS, *([TRACKED_INSIDE] if truth else [])] if tracked else []
         self.tally = Tally(estimator.missed_budget, estimator.largest_missed_budget)
         self._outputs = OutputFolder(folder, inputs)
@@ -136,7 +140,7 @@ class Report:
         box, followed = estimate.box, tracked and tracked.box
         best = estimate if tracked is None or followed is None else tracked
         self._history.add(Moment(start_us, start_us + self.step_us, best.state, box and box.lower, box and box.upper, state, followed))
-        shown = {"truth": state, "explanation": explanation, "title": f"{start_us / 1e6:.3f} s", "attitude": attitude}
+        shown = {"truth": state, "explanation": explanation, "title": f"{start_us / 1e6:.3f} s", "attitude": attitude, "over_time": tracked}
         self._draw(number, frame, estimate, shown)
 
     def _tracked_row(self, instant_us: float, tracked: Estimate | None, truth: NDArray[np.float64] | None) -> list[object]:
@@ -183,9 +187,9 @@ class Report:
     def _assumptions(self) -> list[str]:
         """The model's, and what the caller put in place of its budget."""
         own, used = self.estimator.scene.tolerance.missed_budget, self.estimator.missed_budget
-        if used == own:
-            return self.estimator.metadata["assumptions"]
-        return [*self.estimator.metadata["assumptions"], f"In place of these {own} pixels: at most {used}."]
+        lines = self.estimator.metadata["assumptions"]
+        lines = told_turn(lines, self.estimator.scene) if self._turned else lines
+        return lines if used == own else [*lines, f"In place of these {own} pixels: at most {used}."]
 
 
 def _files_of_report(folder: Path) -> list[str]:
