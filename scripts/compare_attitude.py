@@ -103,10 +103,11 @@ def loaded(model: Path | None, camera: str) -> Estimator:
 
 
 def drawn(estimator: Estimator, row: Row, rng: np.random.Generator) -> TurnedState:
-    """A state whose camera's roll and yaw are about the row's, as far off as its plus-minus allows."""
-    lower, upper = estimator.domain.lower, estimator.domain.upper
+    """A state whose camera's roll and yaw are about the row's, as far off as its plus-minus and the calibration allow."""
+    lower, upper, off = estimator.domain.lower, estimator.domain.upper, estimator.scene.calibration
     c, *rest = lower + (upper - lower) * rng.uniform(0.02, 0.98, 4)
-    roll, yaw = (math.radians(angle + rng.uniform(-1, 1) * row.plus_minus) for angle in (row.roll, row.yaw))
+    sides = (row.roll, off.roll_rad), (row.yaw, off.yaw_rad)
+    roll, yaw = (math.radians(angle) + rng.uniform(-1, 1) * (math.radians(row.plus_minus) + beside) for angle, beside in sides)
     b = -math.atan(math.cos(c) * math.tan(yaw))
     return TurnedState.near(np.array([c, *rest]), -roll + math.atan(math.sin(b) * math.tan(c)), b)
 
@@ -121,10 +122,11 @@ def pitch_reference(estimator: Estimator, theta: float, row: Row, rng: np.random
 
 
 def seen(estimator: Estimator, state: TurnedState, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """The frame of a state, of a camera within the scene's calibration."""
-    view = state.view(estimator.scene)
-    if not estimator.scene.calibration.exact:
-        view = camera_off(rng, Stage("", None, estimator.scene, view))
+    """The frame of a state, of a camera within the scene's calibration, whose share of roll and yaw is the state's."""
+    view, off = state.view(estimator.scene), replace(estimator.scene.calibration, roll_rad=0.0, yaw_rad=0.0)
+    if not off.exact:
+        shown = camera_off(rng, Stage("", None, replace(estimator.scene, calibration=off), view))
+        view = replace(shown, roll=view.roll, yaw=view.yaw)
     return view.image(state.seen).frame.copy()
 
 
@@ -138,7 +140,7 @@ def compared(
         frame = seen(estimator, state, rng)
         half = math.radians(row.plus_minus)
         attitude = None if row.level else state.attitude(rng, half, half)
-        if half and attitude is not None:  # the reading is the row's own
+        if attitude is not None and (half or not estimator.scene.calibration.exact):  # the reading is the row's own
             attitude = replace(attitude, roll_rad=math.radians(row.roll), yaw_rad=math.radians(row.yaw))
         prior = pitch_reference(estimator, float(state.angles[1].mid()), row, rng)
         begun = time.perf_counter()
