@@ -11,7 +11,7 @@ from runtime.motion import tilted
 from runtime.refine.interval import Bits
 from runtime.refine.lit_pixels import LitPixels
 from runtime.refine.optics import Optics
-from runtime.refine.refiner import Refiner, joined
+from runtime.refine.refiner import LARGEST_SENSOR_START, Refiner, joined
 from runtime.refine.sensor_borders import SensorBorders
 from runtime.refine.slices import INTERVALS, rereferenced
 from runtime.rounding import ROUNDING_SHARE, lowered, raised
@@ -22,6 +22,8 @@ BEYOND_PX = 2
 """How far beyond where the sets show their markings the refinement looks at pixels; those farther out it takes for lit."""
 MOST_ENTRIES = 512
 """More passing entries than this are refined as hulls of them."""
+A_HULL = 16
+"""Where an attitude is known so little that hundreds of bins have more entries than that, a hull is of about so many of them."""
 FIRST_ROW_STEP = 2.0**-5
 """Tangent of the rows that reference rows are put together by, at first."""
 MOST_DOUBLINGS = 6
@@ -39,7 +41,7 @@ def refined(refiner: Refiner, parts: tuple[Optics, ...], lit: Bits, entries: Sta
     """
     if len(entries) == 0:
         return entries
-    few = grouped(entries, MOST_ENTRIES)
+    few = grouped(entries, min(max(len(entries) // A_HULL, MOST_ENTRIES), LARGEST_SENSOR_START))
     refiner = replace(refiner, extra_budget=-1)
     if not parts:
         return replace(refiner, window=window_of(refiner.scene, few, None)).refine(lit, few, narrowed=narrowed)

@@ -29,8 +29,10 @@ from rich.table import Table
 from turned_state import Floats, TurnedState
 
 from runtime import Box, Estimator, ModelError, Scene, terminal
+from runtime.attitude import Attitude
 from runtime.errors import fail
 from runtime.scene import Axis, Calibration, Distortion
+from runtime.turned import bins_of, seen_box
 
 PAPER = Path(__file__).parents[1] / "models" / "paper.toml"
 X_CENTRES_M, X_WIDTH_M, LATERAL_PX = (-0.04, 0.0, 0.04), 0.04, 0.7
@@ -50,6 +52,8 @@ class Row:
     pitch: float | None = None
     camera: str = "pinhole"
     """One of `CAMERAS`."""
+    most_frames: int | None = None
+    """Where each takes seconds."""
 
     @property
     def level(self) -> bool:
@@ -69,6 +73,7 @@ ROWS = (
     Row("roll and yaw to +-0.1 degrees", 2.0, -3.0, 0.1),
     Row("and the pitch to +-0.1 degrees", 2.0, -3.0, 0.1, 0.1),
     Row("roll, yaw and pitch to +-0.5 degrees", 2.0, -3.0, 0.5, 0.5),
+    Row("no reference, roll and yaw within +-2 degrees", 0.0, 0.0, 2.0, most_frames=6),
     Row("k1 -0.28, k2 0.07, known", 0.0, 0.0, 0.0, camera="barrel"),
     Row("and roll 2, yaw -3 degrees, known", 2.0, -3.0, 0.0, camera="barrel"),
     Row("a fisheye lens, known", 0.0, 0.0, 0.0, camera="fisheye"),
@@ -130,6 +135,16 @@ def seen(estimator: Estimator, state: TurnedState, rng: np.random.Generator) -> 
     return view.image(state.seen).frame.copy()
 
 
+def runs_of(estimator: Estimator, attitude: Attitude | None, prior: Box | None) -> int:
+    """How often NN_F is run."""
+    known = estimator.known_attitude(attitude)
+    if known is None:
+        return 1
+    box = estimator.domain if prior is None else seen_box(prior, known)
+    low, high = max(box.lower[0], estimator.domain.lower[0]), min(box.upper[0], estimator.domain.upper[0])
+    return len(list(bins_of(estimator.ideal.camera, known, (float(low), float(high)))))
+
+
 def compared(
     estimator: Estimator, pinhole: Estimator, row: Row, frames: int, seed: int
 ) -> tuple[Floats, Floats, list[int], list[float], int]:
@@ -146,8 +161,7 @@ def compared(
         begun = time.perf_counter()
         estimate = estimator.estimate(frame, prior=prior, attitude=attitude)
         spent.append(1000 * (time.perf_counter() - begun))
-        turned = None if attitude is None else estimator.find(frame, attitude, prior).turned
-        runs.append(len(turned.parts) if turned else 1)
+        runs.append(runs_of(estimator, attitude, prior))
         held = state.seen if row.level else state  # by the pitch that the ideal frame shows, where no attitude is told
         if estimate.box is None or not held.within(estimate.box.lower, estimate.box.upper):
             lacking += 1
@@ -177,10 +191,12 @@ def main(
     for row in ROWS:
         if row.camera not in cameras:
             continue
-        widths, level, runs, spent, lacking = compared(cameras[row.camera], cameras["pinhole"], row, frames, seed)
+        count = frames if row.most_frames is None else min(frames, row.most_frames)
+        widths, level, runs, spent, lacking = compared(cameras[row.camera], cameras["pinhole"], row, count, seed)
         medians = np.median(widths, axis=0), np.median(level, axis=0)
         texts = (" ".join(f"{value:.4f}" for value in medians[0]), " ".join(f"{value:.2f}" for value in medians[0] / medians[1]))
-        table.add_row(row.text, *texts, f"{np.median(runs):.0f}", f"{np.median(spent):.0f}", str(lacking))
+        text = row.text if count == frames else f"{row.text} ({count} frames)"
+        table.add_row(text, *texts, f"{np.median(runs):.0f}", f"{np.median(spent):.0f}", str(lacking))
         total += lacking
     console.print(table)
     if total:

@@ -1,4 +1,4 @@
-"""What a camera may be off by shifts and shears offsets by the same parameters: the shift that a shear allows, against sums in fractions."""
+"""What a camera may be off by shifts and shears offsets by the same parameters: the shift that goes with a shear, in fractions."""
 
 from __future__ import annotations
 

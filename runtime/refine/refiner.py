@@ -97,6 +97,8 @@ LEAST_SWAY_PX = 0.25
 """A plus-minus that moves no point of the frame by this much is not cut."""
 LARGEST_START = 512
 """More passing entries than this say that the frame tells next to nothing: they are left as they are, at a bounded cost."""
+LARGEST_SENSOR_START = 2**13
+"""The same of a sensor's frame, whose entries are those of all bins of pitch, yaw and roll."""
 LARGEST_ROUND = 2**18
 """Rows of markings that a round looks at, about: where each set shows very many, fewer pieces are cut, and less finely at first."""
 LARGEST_BLOCK = 2**19
@@ -121,11 +123,11 @@ class Refiner:
         `frame` is dilated by the tolerance. `vouched_pixels`: the lit pixels of S, for Theorem B at tolerance 0; the entries are of one
         cell then. `narrowed`: the entries were cut to what is known besides the frame.
         """
-        if len(entries) > LARGEST_START:
+        flat = self.optics is None and entries.roll is None
+        if len(entries) > (LARGEST_START if flat else LARGEST_SENSOR_START):
             return entries
         witnesses = LitPixels.of(frame, self.window, beyond=True)
         vouched = None if vouched_pixels is None else Vouched(LitPixels.of(vouched_pixels, self.window, beyond=False), self.extra_budget)
-        flat = self.optics is None and entries.roll is None
         level = NONE_MISSED if flat else TURNED if self.optics is None or self.optics.calibration.exact else UNKNOWN
         search = level if self.missed_budget == 0 else NARROWED if narrowed else SOME_MISSED
         if not flat:
