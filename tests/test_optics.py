@@ -223,14 +223,17 @@ def test_a_lens_that_is_known_costs_next_to_nothing(lens: Distortion, estimator_
 @pytest.mark.parametrize(
     ("calibration", "most"),
     [
-        (Calibration(roll_rad=OFF.roll_rad, yaw_rad=OFF.yaw_rad), 1.4),
-        (Calibration(principal_px=OFF.principal_px), 1.5),
-        (OFF, 1.8),
+        (Calibration(roll_rad=OFF.roll_rad, yaw_rad=OFF.yaw_rad), 1.0),
+        (Calibration(principal_px=OFF.principal_px), 1.05),
+        (OFF, 1.15),
     ],
     ids=["rotation", "principal", "all"],
 )
 def test_a_plus_minus_costs_what_it_hides(calibration: Calibration, most: float) -> None:
-    """On the paper's own scene, whose x is fixed; a tolerance of a whole pixel costs five times as much."""
+    """On the paper's own scene, whose x is fixed; a tolerance of a whole pixel costs five times as much.
+
+    A camera that is not in the middle sees its two markings differently, which tells more than what is not known of it hides.
+    """
     paper = Estimator.load()
     assert (extents(paper, replace(PAPER, calibration=calibration), 4, any_camera) < most).all()
 
