@@ -11,10 +11,10 @@ from runtime.motion import tilted
 from runtime.refine.interval import Bits
 from runtime.refine.lit_pixels import LitPixels
 from runtime.refine.optics import Optics
-from runtime.refine.refiner import Refiner, joined
+from runtime.refine.refiner import LARGEST_SENSOR_START, Refiner, joined
 from runtime.refine.sensor_borders import SensorBorders
 from runtime.refine.slices import INTERVALS, rereferenced
-from runtime.rounding import lowered, raised
+from runtime.rounding import ROUNDING_SHARE, lowered, raised
 from runtime.scene import Scene
 from runtime.state_set import StateSet
 
@@ -22,10 +22,15 @@ BEYOND_PX = 2
 """How far beyond where the sets show their markings the refinement looks at pixels; those farther out it takes for lit."""
 MOST_ENTRIES = 512
 """More passing entries than this are refined as hulls of them."""
+A_HULL = 16
+"""Where an attitude is known so little that hundreds of bins have more entries than that, a hull is of about so many of them."""
 FIRST_ROW_STEP = 2.0**-5
 """Tangent of the rows that reference rows are put together by, at first."""
 MOST_DOUBLINGS = 6
 """How often bins of scale and of reference rows are doubled for that."""
+
+LEAST_DEPTH = 2.0**-20
+"""Depth of an end, per unit of its distance, below which it counts as beside the camera."""
 
 
 def refined(refiner: Refiner, parts: tuple[Optics, ...], lit: Bits, entries: StateSet, narrowed: bool) -> StateSet:
@@ -36,7 +41,7 @@ def refined(refiner: Refiner, parts: tuple[Optics, ...], lit: Bits, entries: Sta
     """
     if len(entries) == 0:
         return entries
-    few = grouped(entries, MOST_ENTRIES)
+    few = grouped(entries, min(max(len(entries) // A_HULL, MOST_ENTRIES), LARGEST_SENSOR_START))
     refiner = replace(refiner, extra_budget=-1)
     if not parts:
         return replace(refiner, window=window_of(refiner.scene, few, None)).refine(lit, few, narrowed=narrowed)
@@ -44,14 +49,33 @@ def refined(refiner: Refiner, parts: tuple[Optics, ...], lit: Bits, entries: Sta
 
 
 def _refined_by(refiner: Refiner, optics: Optics, lit: Bits, entries: StateSet, narrowed: bool) -> StateSet:
-    """The same by one part: with its focal lengths, of which scales are multiples, and the pitch that is seen."""
+    """The same by one part: with its focal lengths, of which scales are multiples, and the pitch that is seen.
+
+    Entries that may see an end beside the camera with such a pitch are left as they are: rows tell nothing there.
+    """
     scene, zoom = replace(refiner.scene, camera=optics.camera), optics.camera.focal_u_px / refiner.scene.camera.focal_u_px
     seen = zoomed(entries, zoom)
     seen = tilted(scene.camera, seen, optics.tilt) if optics.tilt else seen
+    ahead = all_ahead(scene, seen)
+    if not ahead.any():
+        return entries
+    seen = seen[ahead]
     sensor = replace(refiner, scene=scene, optics=optics, window=window_of(scene, seen, optics))
     left = sensor.refine(lit, seen, narrowed=narrowed)
     left = tilted(scene.camera, left, optics.tilt) if optics.tilt else left
-    return within_hull(zoomed(left, 1 / zoom), entries)
+    left = within_hull(zoomed(left, 1 / zoom), entries)
+    return left if ahead.all() else joined(left, entries[~ahead])
+
+
+def all_ahead(scene: Scene, sets: StateSet) -> Bits:
+    """True for the sets whose states all see every end of a marking certainly in front of the camera, (sets,).
+
+    The depth y sin(theta) + d cos(theta) is least at corners: it is concave in theta where it is above 0.
+    """
+    d = sets.z[:, 0] + scene.runway.ends_z_m.min()
+    depths = [y * sine + d * cosine for y in sets.y.T for cosine, sine in zip(sets.turn[0].T, sets.turn[1].T, strict=True)]
+    terms = sets.y[:, 1] + np.abs(sets.z[:, 0]) + np.abs(scene.runway.ends_z_m).max()
+    return np.minimum.reduce(depths) > LEAST_DEPTH * (sets.y[:, 1] + np.abs(d)) + ROUNDING_SHARE * terms
 
 
 def zoomed(sets: StateSet, by: float) -> StateSet:

@@ -29,8 +29,10 @@ from rich.table import Table
 from turned_state import Floats, TurnedState
 
 from runtime import Box, Estimator, ModelError, Scene, terminal
+from runtime.attitude import Attitude
 from runtime.errors import fail
 from runtime.scene import Axis, Calibration, Distortion
+from runtime.turned import bins_of, seen_box
 
 PAPER = Path(__file__).parents[1] / "models" / "paper.toml"
 X_CENTRES_M, X_WIDTH_M, LATERAL_PX = (-0.04, 0.0, 0.04), 0.04, 0.7
@@ -50,6 +52,8 @@ class Row:
     pitch: float | None = None
     camera: str = "pinhole"
     """One of `CAMERAS`."""
+    most_frames: int | None = None
+    """Where each takes seconds."""
 
     @property
     def level(self) -> bool:
@@ -69,6 +73,7 @@ ROWS = (
     Row("roll and yaw to +-0.1 degrees", 2.0, -3.0, 0.1),
     Row("and the pitch to +-0.1 degrees", 2.0, -3.0, 0.1, 0.1),
     Row("roll, yaw and pitch to +-0.5 degrees", 2.0, -3.0, 0.5, 0.5),
+    Row("no reference, roll and yaw within +-2 degrees", 0.0, 0.0, 2.0, most_frames=6),
     Row("k1 -0.28, k2 0.07, known", 0.0, 0.0, 0.0, camera="barrel"),
     Row("and roll 2, yaw -3 degrees, known", 2.0, -3.0, 0.0, camera="barrel"),
     Row("a fisheye lens, known", 0.0, 0.0, 0.0, camera="fisheye"),
@@ -103,10 +108,11 @@ def loaded(model: Path | None, camera: str) -> Estimator:
 
 
 def drawn(estimator: Estimator, row: Row, rng: np.random.Generator) -> TurnedState:
-    """A state whose camera's roll and yaw are about the row's, as far off as its plus-minus allows."""
-    lower, upper = estimator.domain.lower, estimator.domain.upper
+    """A state whose camera's roll and yaw are about the row's, as far off as its plus-minus and the calibration allow."""
+    lower, upper, off = estimator.domain.lower, estimator.domain.upper, estimator.scene.calibration
     c, *rest = lower + (upper - lower) * rng.uniform(0.02, 0.98, 4)
-    roll, yaw = (math.radians(angle + rng.uniform(-1, 1) * row.plus_minus) for angle in (row.roll, row.yaw))
+    sides = (row.roll, off.roll_rad), (row.yaw, off.yaw_rad)
+    roll, yaw = (math.radians(angle) + rng.uniform(-1, 1) * (math.radians(row.plus_minus) + beside) for angle, beside in sides)
     b = -math.atan(math.cos(c) * math.tan(yaw))
     return TurnedState.near(np.array([c, *rest]), -roll + math.atan(math.sin(b) * math.tan(c)), b)
 
@@ -121,11 +127,22 @@ def pitch_reference(estimator: Estimator, theta: float, row: Row, rng: np.random
 
 
 def seen(estimator: Estimator, state: TurnedState, rng: np.random.Generator) -> NDArray[np.bool_]:
-    """The frame of a state, of a camera within the scene's calibration."""
-    view = state.view(estimator.scene)
-    if not estimator.scene.calibration.exact:
-        view = camera_off(rng, Stage("", None, estimator.scene, view))
+    """The frame of a state, of a camera within the scene's calibration, whose share of roll and yaw is the state's."""
+    view, off = state.view(estimator.scene), replace(estimator.scene.calibration, roll_rad=0.0, yaw_rad=0.0)
+    if not off.exact:
+        shown = camera_off(rng, Stage("", None, replace(estimator.scene, calibration=off), view))
+        view = replace(shown, roll=view.roll, yaw=view.yaw)
     return view.image(state.seen).frame.copy()
+
+
+def runs_of(estimator: Estimator, attitude: Attitude | None, prior: Box | None) -> int:
+    """How often NN_F is run."""
+    known = estimator.known_attitude(attitude)
+    if known is None:
+        return 1
+    box = estimator.domain if prior is None else seen_box(prior, known)
+    low, high = max(box.lower[0], estimator.domain.lower[0]), min(box.upper[0], estimator.domain.upper[0])
+    return len(list(bins_of(estimator.ideal.camera, known, (float(low), float(high)))))
 
 
 def compared(
@@ -138,14 +155,13 @@ def compared(
         frame = seen(estimator, state, rng)
         half = math.radians(row.plus_minus)
         attitude = None if row.level else state.attitude(rng, half, half)
-        if half and attitude is not None:  # the reading is the row's own
+        if attitude is not None and (half or not estimator.scene.calibration.exact):  # the reading is the row's own
             attitude = replace(attitude, roll_rad=math.radians(row.roll), yaw_rad=math.radians(row.yaw))
         prior = pitch_reference(estimator, float(state.angles[1].mid()), row, rng)
         begun = time.perf_counter()
         estimate = estimator.estimate(frame, prior=prior, attitude=attitude)
         spent.append(1000 * (time.perf_counter() - begun))
-        turned = None if attitude is None else estimator.find(frame, attitude, prior).turned
-        runs.append(len(turned.parts) if turned else 1)
+        runs.append(runs_of(estimator, attitude, prior))
         held = state.seen if row.level else state  # by the pitch that the ideal frame shows, where no attitude is told
         if estimate.box is None or not held.within(estimate.box.lower, estimate.box.upper):
             lacking += 1
@@ -175,10 +191,12 @@ def main(
     for row in ROWS:
         if row.camera not in cameras:
             continue
-        widths, level, runs, spent, lacking = compared(cameras[row.camera], cameras["pinhole"], row, frames, seed)
+        count = frames if row.most_frames is None else min(frames, row.most_frames)
+        widths, level, runs, spent, lacking = compared(cameras[row.camera], cameras["pinhole"], row, count, seed)
         medians = np.median(widths, axis=0), np.median(level, axis=0)
         texts = (" ".join(f"{value:.4f}" for value in medians[0]), " ".join(f"{value:.2f}" for value in medians[0] / medians[1]))
-        table.add_row(row.text, *texts, f"{np.median(runs):.0f}", f"{np.median(spent):.0f}", str(lacking))
+        text = row.text if count == frames else f"{row.text} ({count} frames)"
+        table.add_row(text, *texts, f"{np.median(runs):.0f}", f"{np.median(spent):.0f}", str(lacking))
         total += lacking
     console.print(table)
     if total:

@@ -61,7 +61,11 @@ class DarkPixels:
 
     def missed(self, scene: Scene, states: Floats) -> Integers:
         """|I_r \\ I| of every state, (n,): as many as `runtime.image.runway_image` lights and the frame does not. `states`: (n, 4)."""
-        ends = project(scene, states)
+        return self.missed_of(project(scene, states))
+
+    def missed_of(self, ends: Floats) -> Integers:
+        """The same of images by the ends of their markings, (n, markings, 2, 2)."""
+        ends = ends.copy()
         height, width = self.counted.shape[0], self.counted.shape[1] - 1
         top = int(np.clip(np.floor(ends[..., 1].min()), 0, height - 1))
         bottom = int(np.clip(np.floor(ends[..., 1].max()), top, height - 1)) + 1
@@ -132,7 +136,7 @@ class Sampler:
     def __init__(self, scene: Scene, witnesses: Bits, budget: int, start: Floats, rng: np.random.Generator) -> None:
         """`start`, (4,): a consistent state. Raises ValueError if it is not."""
         self._scene, self._dark, self._budget, self._rng = scene, DarkPixels.of(witnesses), budget, rng
-        self._line = LineCoordinates.around(scene, start)
+        self._line = LineCoordinates.around(scene, start[:4])
         self._free = np.flatnonzero(scene.domain.lower < scene.domain.upper)
         if len(self._allowed(start[None])) == 0:
             raise ValueError("start: the frame or the domain does not allow it; give a state that they do")
@@ -149,7 +153,7 @@ class Sampler:
             before = upper - lower
             lower, upper = self.states.min(axis=0), self.states.max(axis=0)
             rounds += 1
-            still = 0 if (upper - lower > (1 + ENOUGH) * before).any() else still + 1
+            still = 0 if (upper - lower > (1 + ENOUGH) * before)[:4].any() else still + 1
         return Extent(lower, upper, rounds, still == ROUNDS_WITHOUT)
 
     def _tried(self) -> Floats:

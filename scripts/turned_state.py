@@ -58,13 +58,17 @@ class TurnedState:
         (cos_a, sin_a), (cos_b, sin_b), (cos_c, sin_c) = (map(_ball, turn(half)) for half in (self.a, self.b, self.seen.tangent))
         return _product(_z(cos_a, sin_a), _product(_y(cos_b, sin_b), _x(cos_c, sin_c)))
 
-    def aircraft(self, mount: Mount) -> Angles:
-        """The same of the aircraft in which the camera is mounted so: its rotation is R(mount)^T times the camera's."""
+    def aircraft(self, mount: Mount, roll_off: float = 0.0, yaw_off: float = 0.0) -> Angles:
+        """The same of the aircraft in which the camera is mounted so: its rotation is R(mount)^T times the camera's.
+
+        The camera may have so much more of roll and yaw than its mount says.
+        """
         with ctx.workprec(BITS):
-            angles = (-arb(mount.roll_rad), arb(mount.pitch_down_rad), -arb(mount.yaw_rad))
-            roll, pitch, yaw = ((angle.cos(), angle.sin()) for angle in angles)
-            mounted = _product(_z(*roll), _product(_x(*pitch), _y(*yaw)))
-            return _angles_of(_product([list(column) for column in zip(*mounted, strict=True)], self._rotation))
+            mounted = _rotation_of((arb(mount.roll_rad), arb(mount.pitch_down_rad), arb(mount.yaw_rad)))
+            (roll, pitch, yaw), own = self.angles, self._rotation
+            if roll_off or yaw_off:
+                own = _rotation_of((roll - arb(roll_off), pitch, yaw - arb(yaw_off)))
+            return _angles_of(_product([list(column) for column in zip(*mounted, strict=True)], own))
 
     def attitude(self, rng: np.random.Generator, roll_plus_minus: float = 0.0, yaw_plus_minus: float = 0.0) -> Attitude:
         """A reading that is off by the plus-minus at most, which holds the true angles."""
@@ -86,6 +90,12 @@ class TurnedState:
 def holds(low: float, angle: arb, high: float) -> bool:
     """True if a ball lies between two float64, borders included."""
     return bool(angle >= arb(low)) and bool(angle <= arb(high))
+
+
+def _rotation_of(angles: Angles) -> Matrix:
+    """R_z(-roll) R_x(pitch down) R_y(-yaw)."""
+    roll, pitch, yaw = ((angle.cos(), angle.sin()) for angle in (-angles[0], angles[1], -angles[2]))
+    return _product(_z(*roll), _product(_x(*pitch), _y(*yaw)))
 
 
 def _angles_of(rotation: Matrix) -> Angles:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 import typer
 from hypothesis import given
 from hypothesis import strategies as st
+from rational_image import RationalState, RationalView
 from scenes import (
     CUT_BELOW,
     CUT_LEFT,
@@ -32,9 +34,9 @@ from typer.testing import CliRunner
 
 from runtime.camera import project
 from runtime.image import runway_image
-from runtime.scene import Marking, Runway, Scene
+from runtime.scene import Calibration, Marking, Runway, Scene
 
-compare_limit, consistent_states = map(script, ("compare_limit", "consistent_states"))
+compare_limit, consistent_states, limit_of_calibration = map(script, ("compare_limit", "consistent_states", "limit_of_calibration"))
 OVERLAPPING = replace(PAPER, runway=Runway((Marking("L", 0.0, 0.0, 0.3), Marking("C", 0.002, 0.1, 0.3), Marking("R", -0.001, 0.05, 0.05))))
 """Markings that share many of their pixels, in another order in every row."""
 COUNTED = {
@@ -164,3 +166,35 @@ def test_the_command_refuses_what_it_cannot_compare(repository: Path, command: t
     assert result.exit_code == 2
     assert said in result.stderr
     assert "Traceback" not in result.output
+
+
+# --- a camera that may be off ---
+
+
+def test_what_is_sampled_of_a_camera_that_may_be_off_is_lit_and_within_its_bounds() -> None:
+    """The frame of the true camera is that of fractions; the states and cameras that are tried spread on all axes."""
+    scene = replace(FREE_X, calibration=Calibration(0.0009, 0.0009, 0.001, 0.3))
+    bounds, rng = limit_of_calibration.bounds_of(scene.calibration), np.random.default_rng(2)
+    state, unknowns = scene.domain.uniform(rng, 1)[0], bounds * [1.0, -1.0, 0.5, -1.0, 1.0]
+    frame = limit_of_calibration.image_seen(scene, state, unknowns)
+    view = RationalView.of(scene.to_dict())
+    zoom = 1 + Fraction(unknowns[2])
+    exact = replace(
+        view,
+        roll=Fraction(np.tan(unknowns[0] / 2)),
+        yaw=Fraction(np.tan(unknowns[1] / 2)),
+        focal_u=view.focal_u * zoom,
+        focal_v=view.focal_v * zoom,
+        u0=view.u0 + Fraction(unknowns[3]),
+        v0=view.v0 + Fraction(unknowns[4]),
+    )
+    assert (frame == exact.image(RationalState.near(state)).frame).all()
+    sampler = limit_of_calibration.OffSampler(scene, frame, np.concatenate([state, unknowns]), rng)
+    for _ in range(6):
+        sampler.states = sampler._kept(np.concatenate([sampler.states, sampler._tried()]))
+    assert len(sampler.states) > 100
+    assert (np.ptp(sampler.states, axis=0) > 0).all()
+    assert (np.abs(sampler.states[:, 4:]) <= bounds).all()
+    assert all(not (limit_of_calibration.image_seen(scene, each[:4], each[4:]) & ~frame).any() for each in sampler.states[::10])
+    with pytest.raises(ValueError, match="start"):
+        limit_of_calibration.OffSampler(scene, np.zeros_like(frame), np.concatenate([state, unknowns]), rng)

@@ -89,12 +89,16 @@ NARROWED = Search(first=48, sets=144, pieces=6, rounds=20, gain=0.01, z=2, scale
 one, after which the pieces that carry the faces are small enough for the next one to tell more."""
 TURNED = Search(first=512, sets=512, pieces=2, rounds=8, gain=0.02, finest=4, z=2)
 """Pairs of borders tell nothing on a turned sensor: theta is cut, round by round."""
+UNKNOWN = Search(first=512, sets=512, pieces=8, rounds=40, gain=0.005, finest=4, z=2, scale=2, patience=3)
+"""Where a camera may be off by its calibration, each piece is left with what that hides: more of them carry a face, and gains come late."""
 SWAYING = Search(first=512, sets=512, pieces=16, rounds=80, gain=0.002, finest=2, roll=2, yaw=2, patience=3)
 """Roll and yaw are known up to a plus-minus alone: half of it then tells more than half of a slice, and many pieces carry one face."""
 LEAST_SWAY_PX = 0.25
 """A plus-minus that moves no point of the frame by this much is not cut."""
 LARGEST_START = 512
 """More passing entries than this say that the frame tells next to nothing: they are left as they are, at a bounded cost."""
+LARGEST_SENSOR_START = 2**13
+"""The same of a sensor's frame, whose entries are those of all bins of pitch, yaw and roll."""
 LARGEST_ROUND = 2**18
 """Rows of markings that a round looks at, about: where each set shows very many, fewer pieces are cut, and less finely at first."""
 LARGEST_BLOCK = 2**19
@@ -119,12 +123,12 @@ class Refiner:
         `frame` is dilated by the tolerance. `vouched_pixels`: the lit pixels of S, for Theorem B at tolerance 0; the entries are of one
         cell then. `narrowed`: the entries were cut to what is known besides the frame.
         """
-        if len(entries) > LARGEST_START:
+        flat = self.optics is None and entries.roll is None
+        if len(entries) > (LARGEST_START if flat else LARGEST_SENSOR_START):
             return entries
         witnesses = LitPixels.of(frame, self.window, beyond=True)
         vouched = None if vouched_pixels is None else Vouched(LitPixels.of(vouched_pixels, self.window, beyond=False), self.extra_budget)
-        flat = self.optics is None and entries.roll is None
-        level = NONE_MISSED if flat else TURNED
+        level = NONE_MISSED if flat else TURNED if self.optics is None or self.optics.calibration.exact else UNKNOWN
         search = level if self.missed_budget == 0 else NARROWED if narrowed else SOME_MISSED
         if not flat:
             entries = self._contracted(witnesses, vouched, entries)  # most contradict the frame as they are
@@ -147,10 +151,14 @@ class Refiner:
         return pieces
 
     def _with_turns(self, search: Search, entries: StateSet) -> Search:
-        """The search of entries with roll and yaw, which cuts them where their plus-minus moves a point of the frame visibly."""
-        camera = self.scene.camera
+        """The search of entries with roll and yaw, which cuts them where their plus-minus moves a point of the frame visibly.
+
+        What the calibration has of that is not worth cutting: it is told from the rest of the calibration by nothing.
+        """
+        camera, off = self.scene.camera, self.scene.calibration
         reach = {"roll": math.hypot(camera.width, camera.height) / 2, "yaw": max(camera.focal_u_px, camera.focal_v_px)}
-        widths = {name: float(np.ptp(getattr(entries, name), axis=1).max(initial=0.0)) * px for name, px in reach.items()}
+        beside = {"roll": 2 * off.roll_rad, "yaw": 2 * off.yaw_rad}
+        widths = {name: (float(np.ptp(getattr(entries, name), axis=1).max(initial=0.0)) - beside[name]) * px for name, px in reach.items()}
         cuts = {name: getattr(SWAYING, name) for name, width_px in widths.items() if width_px >= LEAST_SWAY_PX}
         if not cuts:
             return search

@@ -37,29 +37,37 @@ def contract_by_sheared_offsets(sets: StateSet, sight: Sight) -> StateSet:
     assert isinstance(borders, SensorBorders)
     assert borders.unknowns is not None
     seen, ends = _seen(borders, sight), sheared_at_ends(borders, sight)
-    known = borders.unknowns.known
-    largest, scaled, shifted = (
-        np.where(known, side, 0.0) for side in (borders.unknowns.sheared_px, borders.unknowns.scaled, borders.unknowns.shifted_px)
-    )
+    unknowns, known = borders.unknowns, borders.unknowns.known
+    largest, scaled = (np.where(known, side, 0.0) for side in (unknowns.sheared_px, unknowns.scaled))
     scale = lowered(sets.scale[:, 0] * (1 - scaled), sets.scale[:, 0]), raised(sets.scale[:, 1] * (1 + scaled), sets.scale[:, 1])
-    shift = shifted / np.where(scale[0] > 0, scale[0], np.nan)
-    shift = np.where(np.isfinite(shift), shift, np.inf) * (1 + ROUNDING_SHARE)
-    x = sets.x[:, 0] - shift, sets.x[:, 1] + shift
     at_ends = [] if ends is None or not (sight.missed.left == 0).any() else [ends]
     hull, count = _Hull.none(len(sets)), _pieces([*seen, *at_ends], largest)
     for number in range(count):
         least, most = largest * (2 * number / count - 1), largest * (2 * (number + 1) / count - 1)
         parts, whole = ([_unsheared(part, least, most) for part in side] for side in (seen, at_ends))
-        hull = hull.joined(*_by_piece(sight, parts, whole, scale, x))
+        shift = _over(unknowns.shifted_px(least, most), scale)
+        x = lowered(sets.x[:, 0] + shift[0], np.abs(sets.x[:, 0])), raised(sets.x[:, 1] + shift[1], np.abs(sets.x[:, 1]))
+        of_piece, seen_x, holds = _by_piece(sight, parts, whole, scale, x)
+        seen_x = seen_x[0] - shift[1], seen_x[1] - shift[0]
+        hull = hull.joined(of_piece, seen_x, holds)
     refuted = (known & ~hull.some) | (sight.missed.left < 0)
     low, high = (np.where(hull.some, side, 1.0) for side in hull.scale)
     low, high = lowered(low / (1 + scaled), low), raised(high / (1 - scaled), high)
     x_low, x_high = (np.where(hull.some, side, 0.0) for side in hull.x)
-    x_low, x_high = lowered(x_low - shift, np.abs(x_low) + shift), raised(x_high + shift, np.abs(x_high) + shift)
+    x_low, x_high = (rounded(side, np.abs(side) + np.abs(sets.x).max(axis=1)) for rounded, side in ((lowered, x_low), (raised, x_high)))
     low, high, x_low, x_high = (
         np.where(known, side, bound) for side, bound in zip((low, high, x_low, x_high), (0.0, np.inf, -np.inf, np.inf), strict=True)
     )
     return sets.contracted(scale=(low, high), x=(x_low, x_high)).emptied(refuted)
+
+
+def _over(shift_px: Interval, scale: Interval) -> Interval:
+    """Range of C/scale'', (sets,), m; without bounds where the scale may be 0."""
+    low, high = shift_px
+    slow, fast = np.where(scale[0] > 0, scale[0], 1.0), scale[1]
+    low, high = np.minimum(low / slow, low / fast), np.maximum(high / slow, high / fast)
+    low, high = lowered(low, np.abs(low)), raised(high, np.abs(high))
+    return np.where(scale[0] > 0, low, -np.inf), np.where(scale[0] > 0, high, np.inf)
 
 
 def _seen(borders: SensorBorders, sight: Sight) -> list[Sheared]:

@@ -13,7 +13,8 @@ with numbers c, k, d of the set; then an offset as it is seen by the parameters 
 
     h0 = (p_x - x'') scale'' - kappa (w - w*) - rest        scale'' = scale (1 - G),  x'' = x + C/scale''
 
-with |G| <= sum of |d_p| off_p, and likewise C and kappa. Parameters and pitches other than those in the middle turn 1/w into
+with |G| <= sum of |d_p| off_p, and likewise kappa, and C for each kappa (`shifted_px`): way by way they grow in proportion to the
+parameters, by a factor that they share. Parameters and pitches other than those in the middle turn 1/w into
 (1 + mu)/w + nu + small, with mu and nu the same for all points: w becomes rho* (1 + eta) w, rho* = 1/(1 + mu + nu w*),
 
     |eta| <= (|nu| |w - w*| + small w) / (1 - |mu| - |nu| w - small w)
@@ -33,13 +34,15 @@ from functools import cached_property
 import numpy as np
 
 from runtime.refine.around import Around
-from runtime.refine.interval import Bits, Floats
+from runtime.refine.interval import Bits, Floats, Interval
 from runtime.refine.optics import Optics
 from runtime.refine.view import ROUNDED_SWAY, View
 from runtime.rounding import ROUNDING_SHARE
 
 LEAST_APART = 2.0**-10
 """Points whose w or q differ by less tell nothing of how a derivative depends on it."""
+LEAST_SLOPE = 2.0**-20
+"""A parameter that shears less says nothing of how it shifts what it shears."""
 STEEPEST_COSINE = 0.25
 """Of the pitch: for a camera that looks farther down, another pitch is not taken for a change of mu and nu."""
 LARGEST_CHANGE = 0.5
@@ -273,10 +276,24 @@ class Unknowns:
         """Largest |G|, (sets,)."""
         return self._total(self.d)
 
-    @property
-    def shifted_px(self) -> Floats:
-        """Largest |C|, (sets,)."""
-        return self._total(self.c) * self.focal
+    def shifted_px(self, least: Floats, most: Floats) -> Interval:
+        """Range of C, (sets,), where kappa lies between two numbers: both are sums over the same parameters.
+
+        C <= sum of |c_p - l k_p| off_p + max(l least, l most) for every number l; the best l is 0 or one of the c_p/k_p.
+        """
+        size = self._growth * self.focal
+        slopes = [np.zeros(1)]
+        for c, k in zip(self.c, self.k, strict=True):
+            slopes.append(c / np.where(np.abs(k) > LEAST_SLOPE, k, np.inf))
+        low, high = np.full(len(least), -np.inf), np.full(len(least), np.inf)
+        for slope in slopes:
+            beside = self._sum(tuple(c - slope * k for c, k in zip(self.c, self.k, strict=True)))
+            terms = self._sum(tuple(np.abs(c) + np.abs(slope * k) for c, k in zip(self.c, self.k, strict=True)))
+            ends, beside = (slope * least, slope * most), (beside + ROUNDING_SHARE * terms) * size
+            margin = ROUNDING_SHARE * np.maximum(np.abs(ends[0]), np.abs(ends[1]))
+            low = np.maximum(low, np.minimum(*ends) - beside - margin)
+            high = np.minimum(high, np.maximum(*ends) + beside + margin)
+        return low, high
 
     @property
     def sheared_px(self) -> Floats:

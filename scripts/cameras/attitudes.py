@@ -17,7 +17,7 @@ from turned_state import HAIR, Angles, Floats, TurnedState, holds
 from cameras.scenes import LARGEST_RAD
 from runtime import Attitude, Box, Estimator
 from runtime.attitude import Angle, mounted
-from runtime.scene import AttitudeBounds
+from runtime.scene import Calibration
 from runtime.turned import bins_of, seen_box
 
 KNOWN = {"level": 0.1, "attitude known exactly": 0.4, "attitude to 0.1 degrees": 0.3, "attitude to 0.6 degrees": 0.2}
@@ -39,9 +39,9 @@ class Told:
     prior: Box | None
     kinds: Kinds
 
-    def holds(self, state: TurnedState, stated: Attitude | None) -> bool:
-        """True if a state is as the camera is told to be; `stated`: by the scene."""
-        attitude = self.attitude or stated
+    def holds(self, state: TurnedState, estimator: Estimator) -> bool:
+        """True if a state is as the camera is told to be, by the frame's attitude or the scene's, and its calibration."""
+        attitude = estimator.known_attitude(self.attitude)
         roll, _, yaw = state.angles
         if attitude is None:
             return state.a == state.b == 0 and self._in_prior(state)
@@ -52,9 +52,9 @@ class Told:
         return self.prior is None or state.within(self.prior.lower, self.prior.upper)
 
 
-def draw_turn(rng: Rng, seen: RationalState, bounds: AttitudeBounds | None) -> TurnedState:
+def draw_turn(rng: Rng, seen: RationalState, bounds: Attitude | None) -> TurnedState:
     """A state whose roll and yaw lie within the bounds, or within `LARGEST_RAD`, often at the largest, at none or near to it."""
-    sides = ((-LARGEST_RAD, LARGEST_RAD),) * 2 if bounds is None else (bounds.roll_rad, bounds.yaw_rad)
+    sides = ((-LARGEST_RAD, LARGEST_RAD),) * 2 if bounds is None else (bounds.roll, bounds.yaw)
     angles = []
     for low, high in sides:
         shares = [0.0, 1.0, float(rng.uniform(0, 1))] if bounds is None else [1e-9, 1 - 1e-9, float(rng.uniform(1e-9, 1 - 1e-9))]
@@ -73,16 +73,20 @@ def turned_by(seen: RationalState, roll: float, yaw: float) -> TurnedState:
 
 @dataclass(frozen=True)
 class Readings:
-    """Half-widths of what is told of roll, pitch and yaw, rad, (3,), and the share of it that readings are off; pitch may not be told."""
+    """Half-widths of what is told of roll, pitch and yaw, rad, (3,), and the share of it that readings are off; pitch may not be told.
+
+    `beside`: by how much more they are off, as far as the calibration allows.
+    """
 
     halves: Floats
     off: Floats
+    beside: Floats
     pitch: bool
     kinds: Kinds
 
     @staticmethod
-    def draw(rng: Rng, stated: bool) -> Readings:
-        """Of a frame whose camera's roll and yaw no scene states, or one does."""
+    def draw(rng: Rng, stated: bool, calibration: Calibration) -> Readings:
+        """Of a frame whose camera's roll and yaw no scene states, or one does, of a camera that may be off."""
         chosen = {name: share for name, share in KNOWN.items() if name != "level"}
         known = str(rng.choice(list(chosen), p=np.array(list(chosen.values())) / sum(chosen.values())))
         low, high = np.log10(PLUS_MINUS_RAD.get(known, (1.0, 1.0)))
@@ -90,7 +94,10 @@ class Readings:
         halves[[0, 2]] *= ((1, 1), (0, 1), (1, 0))[rng.integers(3)]
         halves[1] = 10.0 ** rng.uniform(*np.log10(PITCH_PLUS_MINUS_RAD).tolist())
         off = np.where(rng.random(3) < 0.5, rng.choice([-1.0, 1.0], 3), rng.uniform(-1, 1, 3))
-        return Readings(halves, off, bool(rng.random() < PITCH_TOLD), ("as the scene states",) if stated else (known,))
+        beside = np.array([calibration.roll_rad, 0.0, calibration.yaw_rad])
+        if beside.any():
+            beside *= np.where(rng.random(3) < 0.5, rng.choice([-1.0, 1.0], 3), rng.uniform(-1, 1, 3))
+        return Readings(halves, off, beside, bool(rng.random() < PITCH_TOLD), ("as the scene states",) if stated else (known,))
 
     @property
     def better(self) -> Readings:
@@ -103,7 +110,8 @@ class Readings:
         attitude, theta = self._of_camera(state)
         if mount is not None and estimator.scene.attitude is None:
             try:
-                attitude, theta = mounted(mount, *self._intervals(state.aircraft(mount)))
+                roll_off, _, yaw_off = self.beside.tolist()
+                attitude, theta = mounted(mount, *self._intervals(state.aircraft(mount, roll_off, yaw_off), np.zeros(3)))
                 kinds = (*kinds, "by the aircraft's reading")
             except ValueError:  # a camera that looks down, of which no aircraft's angles tell the roll
                 kinds = (*kinds, NOT_MOUNTED)
@@ -114,17 +122,18 @@ class Readings:
 
     def _of_camera(self, state: TurnedState) -> tuple[Attitude, Angle]:
         """The camera's own attitude, and the interval of its theta."""
-        roll, theta, yaw = self._intervals(state.angles)
+        roll, theta, yaw = self._intervals(state.angles, self.beside)
         return Attitude.between(roll, yaw), theta
 
-    def _intervals(self, angles: Angles) -> tuple[Angle, ...]:
-        """Of roll, pitch down and yaw."""
-        return tuple(_around(*each) for each in zip(angles, self.halves.tolist(), self.off.tolist(), strict=True))
+    def _intervals(self, angles: Angles, beside: Floats) -> tuple[Angle, ...]:
+        """Of roll, pitch down and yaw, of which the true ones are so much more."""
+        sides = zip(angles, self.halves.tolist(), self.off.tolist(), beside.tolist(), strict=True)
+        return tuple(_around(angle - arb(more), half, share) for angle, half, share, more in sides)
 
 
 def draw_told(rng: Rng, estimator: Estimator, state: TurnedState, level: bool) -> Told:
     """What is told of a state's camera, enough for `MOST_RUNS`; nothing of its attitude where it is level."""
-    readings = Readings.draw(rng, estimator.scene.attitude is not None)
+    readings = Readings.draw(rng, estimator.scene.attitude is not None, estimator.scene.calibration)
     if level:
         prior = replace(readings, kinds=("level",)).told(estimator, state)
         return replace(prior, attitude=None)
@@ -145,7 +154,7 @@ def _around(angle: arb, half: float, share: float) -> Angle:
 
 def runs(estimator: Estimator, told: Told) -> int:
     """How often NN_F is run, up to one more than `MOST_RUNS`."""
-    attitude = told.attitude or estimator.attitude
+    attitude = estimator.known_attitude(told.attitude)
     if attitude is None:
         return 1
     box = estimator.domain if told.prior is None else seen_box(told.prior, attitude)

@@ -25,7 +25,7 @@ from rich.table import Table
 
 from cameras.attitudes import KNOWN, NOT_MOUNTED
 from cameras.bases import named_scenes
-from cameras.frames import CLUTTER, STATES, TURNED_ORDERS
+from cameras.frames import BUDGETED, CLUTTER, STATES, TURNED_ORDERS
 from cameras.trial import CameraTrial
 from runtime import SceneError
 from runtime.errors import fail
@@ -42,7 +42,7 @@ def table_of_kinds(counts: dict[str, Counter[str]]) -> Table:
     for heading in ("kind", *COLUMNS):
         view.add_column(heading, justify="left" if heading == "kind" else "right")
     told = [*KNOWN, "as the scene states", "pitch told", "by the aircraft's reading", NOT_MOUNTED]
-    frames = (told, list(STATES), list(CLUTTER), ["m = 0", "m > 0", *TURNED_ORDERS])
+    frames = (told, list(STATES), list(CLUTTER), ["m = 0", "m > 0", *TURNED_ORDERS, *BUDGETED.values()])
     known = {kind for kinds in frames for kind in kinds} | {*PLACES, "all"}
     cameras = sorted(kind for kind in counts if kind not in known)
     for kinds in (cameras, [kind for kind in PLACES if kind in counts], *frames, ["all"]):

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from fractions import Fraction
 
 import numpy as np
-from coverage.frames import Picture, everything, longer_markings, neighbourhood, put_out, speckle
+from coverage.frames import Picture, everything, keep_out_of_spatial_mask, longer_markings, neighbourhood, put_out, speckle
 from coverage.scenarios import camera_off
 from coverage.states import Stage, image_of, into_domain, nudge, uniform
 from random_scenes.frames import ORDERS, DrawnFrame, faces_if_any
@@ -32,15 +32,26 @@ TURNED_ORDERS = {name: order for name, order in ORDERS.items() if name != "dark 
 UNREFINED = 0.2
 """Share of the frames that are judged without refinement too."""
 MOST_MISSED = 8
+OFF_AND_LEVEL = 0.2
+"""How much more often a camera that may be off is level, and nothing told of its attitude."""
+EXTRA = (0, 1, 3, 8)
+VOUCHED = {True: 0.4, False: 0.1}
+"""How often a pinhole's model has a budget of Theorem B, which a level camera's frames keep; with an attitude it is not used."""
+BUDGETED = {True: "Theorem B", False: "Theorem B's budget, with an attitude"}
 TRIES = 20
 
 
 @dataclass(frozen=True)
 class Sight:
-    """A state, and the camera that a frame of it is taken by: turned, and off by its calibration."""
+    """A state, and the camera that a frame of it is taken by: turned, and off by its calibration.
+
+    `counted`: the camera whose image may lack no more pixels than the budget: of a level pinhole the scene's own, as its calibration is
+    part of `line_px`.
+    """
 
     state: TurnedState
     view: RationalView
+    counted: RationalView
 
 
 @dataclass(frozen=True)
@@ -54,38 +65,47 @@ class TurnedFrame(DrawnFrame):
 
 def draw_frame(rng: Rng, stage: Stage, estimator_of: Callable[[int], Estimator]) -> TurnedFrame:
     """A frame; `estimator_of` loads the model with a budget m."""
-    estimator = estimator_of(0)
-    bounds, off = stage.scene.attitude, stage.scene.calibration
-    level = bounds is None and bool(rng.random() < KNOWN["level"] or off.roll_rad or off.yaw_rad)
+    estimator, off = estimator_of(0), stage.scene.calibration
+    level = estimator.attitude is None and bool(rng.random() < KNOWN["level"] + OFF_AND_LEVEL * (not off.exact))
     most = min(estimator.largest_missed_budget, MOST_MISSED)
     missed = int(rng.integers(1, most + 1)) if most > 0 and rng.random() < 0.35 else 0
+    extra = int(rng.choice(EXTRA)) if stage.view.lens is None and rng.random() < VOUCHED[level] else -1
     kind = str(rng.choice(list(STATES), p=list(STATES.values())))
-    camera = camera_off(rng, stage)
+    camera = camera_off(rng, stage if level else without_turn(stage))
     seen = as_fixed(stage, (faces_if_any if kind == "state on faces" else uniform)(rng, stage))
-    turned = TurnedState(seen, Fraction(0), Fraction(0)) if level else draw_turn(rng, seen, bounds)
+    turned = TurnedState(seen, Fraction(0), Fraction(0)) if level else draw_turn(rng, seen, estimator.known_attitude(None))
     view = camera if level else turned.turned(camera)
     if kind == "an end on a border of rows":
         turned = on_a_border(rng, stage, turned, view)
     told = draw_told(rng, estimator, turned, level)
-    sights = [Sight(turned, view)]
+    sights = [Sight(turned, view, stage.counted(view) if level else view)]
     picture, clutter = drawn(rng, stage, estimator, sights, told, level)
+    if level and extra >= 0:
+        keep_out_of_spatial_mask(rng, picture, extra)
     order = str(rng.choice(list(TURNED_ORDERS)))
     if missed:
         put_out(picture, TURNED_ORDERS[order](rng, picture), missed)
     refine = (True, False) if rng.random() < UNREFINED else (True,)
-    kinds = (kind, clutter, *told.kinds, *((order, "m > 0") if missed else ("m = 0",)))
-    return TurnedFrame(picture, (missed, -1), (*kinds, "all"), None, tuple(sights), told, refine)
+    kinds = (kind, clutter, *told.kinds, *((order, "m > 0") if missed else ("m = 0",)), *((BUDGETED[level],) if extra >= 0 else ()))
+    return TurnedFrame(picture, (missed, extra), (*kinds, "all"), None, tuple(sights), told, refine)
+
+
+def without_turn(stage: Stage) -> Stage:
+    """The stage of a camera that is not off in roll and yaw: of a turned one, readings are."""
+    calibration = replace(stage.scene.calibration, roll_rad=0.0, yaw_rad=0.0)
+    return replace(stage, scene=replace(stage.scene, calibration=calibration))
 
 
 def drawn(rng: Rng, stage: Stage, estimator: Estimator, sights: list[Sight], told: Told, level: bool) -> tuple[Picture, str]:
     """The picture of the first sight with clutter over it, and the clutter's kind; adds the sight of a second runway."""
     true = sights[0]
-    own = replace(stage, view=true.view)
+    tolerance = stage.scene.tolerance if level else replace(stage.scene.tolerance, line_px=estimator.beside_px)
+    own = replace(stage, view=true.counted, scene=replace(stage.scene, tolerance=tolerance))
     runway = image_of(true.view, true.state.seen).frame
     picture = Picture(own, true.view, [true.state.seen], runway, runway.copy())
     clutter = str(rng.choice(list(CLUTTER), p=list(CLUTTER.values())))
     if clutter == "second runway":
-        sights.append(other_sight(rng, stage, true, told.attitude or estimator.attitude, level))
+        sights.append(other_sight(rng, stage, true, estimator.known_attitude(told.attitude), level))
         picture.frame |= image_of(sights[1].view, sights[1].state.seen).frame
     if clutter in DENSITY:
         speckle(rng, picture, *DENSITY[clutter])
@@ -100,9 +120,10 @@ def other_sight(rng: Rng, stage: Stage, true: Sight, attitude: Attitude | None, 
     floats = np.clip(true.state.seen.floats + rng.uniform(-1, 1, 4) * spread, stage.lower, stage.upper)
     seen = as_fixed(stage, into_domain(stage, RationalState.near(floats)))
     if attitude is None or level:
-        return Sight(replace(true.state, seen=seen), true.view)
+        return Sight(replace(true.state, seen=seen), true.view, true.counted)
     state = turned_by(seen, *(float(rng.uniform(low, high)) for low, high in (attitude.roll, attitude.yaw)))
-    return Sight(state, state.turned(true.view))
+    view = state.turned(true.view)
+    return Sight(state, view, view)
 
 
 def on_a_border(rng: Rng, stage: Stage, state: TurnedState, view: RationalView) -> TurnedState:

@@ -20,9 +20,9 @@ ASPECTS, OFF_CENTRE = (0.95, 1.05), 0.1
 LARGEST_RAD = math.radians(10)
 """Roll and yaw of the camera stay within this."""
 LINE_PX = {0: 0.85, 1: 0.15}
-MOUNTED, BOUNDED, OFF = 0.3, 0.15, 0.15
-"""How often a camera is mounted otherwise than along the aircraft's axis, how often a scene states the attitude, and how often a camera
-behind a lens may be off by its calibration."""
+MOUNTED, BOUNDED, OFF = 0.3, 0.15, 0.3
+"""How often a camera is mounted otherwise than along the aircraft's axis, how often a scene states the attitude, and how often a camera may
+be off by its calibration."""
 STEEPEST_MOUNT_RAD = 1.55
 WIDEST_BOUNDS_RAD = (1e-4, 0.02)
 """Half-widths of a stated attitude."""
@@ -65,15 +65,19 @@ def draw_camera(rng: Rng, scene: Scene) -> DrawnCamera:
         mount=mount,
     )
     line_px = int(rng.choice(list(LINE_PX), p=list(LINE_PX.values())))
-    off = draw_calibration(rng) if lens is not None and rng.random() < OFF else Calibration()
-    bounds = draw_bounds(rng) if rng.random() < BOUNDED and off.exact else None
+    off = draw_calibration(rng) if rng.random() < OFF else Calibration()
+    if lens is None:
+        line_px += whole_pixels(drawn, off)
+    bounds = draw_bounds(rng) if rng.random() < BOUNDED else None
     kinds = {
         kind: True,
         "tangential": lens is not None and lens.model != "fisheye" and any(lens.coefficients[2:4]),
         "F_u/F_v off by more than 2 %": abs(aspect - 1) > 0.02,
         "principal point off by more than 5 %": max(abs(right), abs(down)) > OFF_CENTRE / 2,
-        f"line_px {line_px}": line_px > 0,
+        "line_px 1" if line_px == 1 else "line_px 2 or more": line_px > 0,
         "camera off": not off.exact,
+        "camera off, no lens": not off.exact and lens is None,
+        "camera off in roll and yaw": off.roll_rad > 0,
         "mounted": mount is not None,
         "[attitude] stated": bounds is not None,
     }
@@ -91,10 +95,18 @@ def draw_mount(rng: Rng, scene: Scene) -> Mount:
 
 
 def draw_calibration(rng: Rng) -> Calibration:
-    """What a camera is off by; every second time in focal length and principal point alone."""
-    turned = rng.random() < 0.5
-    roll, yaw, focal, principal = (float(share) for share in rng.uniform(0, 1, 4) * (0.001 * turned, 0.001 * turned, 0.001, 0.5))
+    """What a camera is off by, or a tenth or less of it; every second time in focal length and principal point alone."""
+    turned, share = rng.random() < 0.5, float(rng.choice([1.0, 10.0 ** rng.uniform(-3, -1)]))
+    roll, yaw, focal, principal = (float(side) for side in share * rng.uniform(0, 1, 4) * (0.001 * turned, 0.001 * turned, 0.001, 0.5))
     return Calibration(roll, yaw, focal, principal)
+
+
+def whole_pixels(camera: Camera, off: Calibration) -> int:
+    """About by how many whole pixels a pinhole's plus-minus may move what its frame shows: the build asks for them as `line_px`."""
+    sides = max(camera.u0, camera.width - camera.u0), max(camera.v0, camera.height - camera.v0)
+    reach, focal = math.hypot(*sides), max(camera.focal_u_px, camera.focal_v_px)
+    turned = off.roll_rad * reach + off.yaw_rad * focal * (1 + (reach / focal) ** 2)
+    return math.ceil(turned + off.focal_relative * max(sides) + off.principal_px)
 
 
 def draw_bounds(rng: Rng) -> AttitudeBounds:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from coverage.judge import Judged
+from coverage.judge import Judged, extra_pixels
 from coverage.states import estimator_of, image_of
 from random_scenes.frame_trial import FrameTrial
 from random_scenes.models import BuiltScene, build_scene
@@ -40,6 +40,11 @@ class CameraFrameTrial(FrameTrial):
         return self.frame
 
     @property
+    def alike(self) -> str:
+        """How well the attitude is known: a plus-minus is cut, and NN_F run again and again."""
+        return self.turned.told.kinds[0]
+
+    @property
     def refinements(self) -> tuple[bool, ...]:
         """As drawn."""
         return self.turned.refine
@@ -61,13 +66,19 @@ class CameraFrameTrial(FrameTrial):
         return self.estimator.estimate(self.frame.picture.frame, refine=refine, prior=told.prior, attitude=told.attitude)
 
     def judged(self) -> list[Judged]:
-        """The states of the frame's sights that lie in the domain, are as is told, and lack no more pixels than the budget."""
-        picture, told, stated = self.frame.picture, self.turned.told, self.estimator.attitude
+        """The states of the frame's sights that lie in the domain, are as is told, and lack no more pixels than the budget.
+
+        Where nothing is told of the attitude, there may be no more extra pixels than under Theorem B either.
+        """
+        picture, told, (missed, extra) = self.frame.picture, self.turned.told, self.frame.budgets
+        vouched = extra >= 0 and self.estimator.known_attitude(told.attitude) is None
         judged = []
         for sight in self.turned.sights:
             state, image = sight.state, image_of(sight.view, sight.state.seen)
-            allowed = picture.stage.unwitnessed(image, picture.frame) <= self.frame.budgets[0]
-            if allowed and picture.stage.contains(state.seen) and told.holds(state, stated):
+            allowed = picture.stage.unwitnessed(image_of(sight.counted, sight.state.seen), picture.frame) <= missed
+            if not (allowed and picture.stage.contains(state.seen) and told.holds(state, self.estimator)):
+                continue
+            if not vouched or extra_pixels(picture, state.seen) <= extra:
                 judged.append(Judged(state, image.frame & picture.frame))
         return judged
 

@@ -60,6 +60,11 @@ class FrameTrial:
                 self.numbers.update(extremes=1, reached=int(extreme.in_outer_part(boxes[0], OUTER_PART)))
 
     @property
+    def alike(self) -> str:
+        """Frames of a scene with the same are alike in what they take, but for the frame."""
+        return ""
+
+    @property
     def refinements(self) -> tuple[bool, ...]:
         """With refinement, and without."""
         return True, False
@@ -97,12 +102,13 @@ class FrameTrial:
 
 
 def find_slow(trials: Sequence[FrameTrial]) -> None:
-    """Adds a finding to each frame that took far longer than the others of its scene, though it ended."""
-    ended = [trial for trial in trials if not trial.endless]
-    median = statistics.median(trial.seconds for trial in ended) if ended else 0.0
-    for trial in ended:
-        if trial.seconds > max(SLOW_RATIO * median, SLOW_SECONDS):
-            trial.find("a frame is slow", f"{trial.seconds:.2f} s; the median of its scene is {median:.4f} s")
+    """Adds a finding to each frame that took far longer than the others of its scene that are alike, though it ended."""
+    for alike in sorted({trial.alike for trial in trials}):
+        ended = [trial for trial in trials if not trial.endless and trial.alike == alike]
+        median = statistics.median(trial.seconds for trial in ended) if ended else 0.0
+        for trial in ended:
+            if trial.seconds > max(SLOW_RATIO * median, SLOW_SECONDS):
+                trial.find("a frame is slow", f"{trial.seconds:.2f} s; the median of its scene is {median:.4f} s")
 
 
 def kind_of(fault: str) -> str:
