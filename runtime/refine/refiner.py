@@ -87,8 +87,8 @@ SOME_MISSED = Search(first=48, sets=144, pieces=6, rounds=20, gain=0.03, z=2, sc
 NARROWED = Search(first=48, sets=144, pieces=6, rounds=20, gain=0.01, z=2, scale=2, patience=2)
 """Pixels may be missed, and the entries were cut to a prior: they are few, so that there is time for small gains, and for a round without
 one, after which the pieces that carry the faces are small enough for the next one to tell more."""
-TURNED = Search(first=512, sets=512, pieces=2, rounds=8, gain=0.02, finest=4, z=2)
-"""Pairs of borders tell nothing on a turned sensor: theta is cut, round by round."""
+TURNED = Search(first=512, sets=512, pieces=4, rounds=40, gain=0.01, finest=4, z=2, scale=2, patience=2)
+"""Pairs of borders tell nothing on a turned sensor: theta is cut, round by round, and the scale: some frames stay far wider without."""
 UNKNOWN = Search(first=512, sets=512, pieces=8, rounds=40, gain=0.005, finest=4, z=2, scale=2, patience=3)
 """Where a camera may be off by its calibration, each piece is left with what that hides: more of them carry a face, and gains come late."""
 SWAYING = Search(first=512, sets=512, pieces=16, rounds=80, gain=0.002, finest=2, roll=2, yaw=2, patience=3)
