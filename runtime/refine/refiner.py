@@ -72,21 +72,22 @@ class Search:
     """Parts that a piece which carries a face is cut into along each interval."""
     patience: int = 1
     """So many rounds in a row must take less than the share."""
+    together: bool = False
+    """Scale and z are cut in every round, not in turns."""
 
     def others(self, number: int) -> dict[str, int]:
-        """Parts along all intervals but theta's in the round of this number: along scale and z in turns, scale first."""
+        """Parts along all intervals but theta's in the round of this number: along scale and z in turns, scale first, or along both."""
         parts = {name: getattr(self, name) for name in ("z", "scale", "roll", "yaw")}
-        return parts | {"scale" if number % 2 else "z": 1}
+        return parts if self.together else parts | {"scale" if number % 2 else "z": 1}
 
 
 FACES = 6
 """Of the box in theta, y and z that is searched."""
 NONE_MISSED = Search(first=48, sets=96, pieces=6, rounds=8, gain=0.06, z=2, scale=2)
-SOME_MISSED = Search(first=48, sets=144, pieces=6, rounds=20, gain=0.03, z=2, scale=2)
-"""Missed pixels are counted where windows are a pixel or two wide (`missed`): then smaller pieces pay, cut along the scale too."""
-NARROWED = Search(first=48, sets=144, pieces=6, rounds=20, gain=0.01, z=2, scale=2, patience=2)
-"""Pixels may be missed, and the entries were cut to a prior: they are few, so that there is time for small gains, and for a round without
-one, after which the pieces that carry the faces are small enough for the next one to tell more."""
+SOME_MISSED = Search(first=24, sets=216, pieces=4, rounds=20, gain=0.05, z=2, scale=2, together=True)
+"""Missed pixels are counted where windows are a pixel or two wide (`missed`): then smaller pieces pay, cut along scale and z at once."""
+NARROWED = Search(first=4, sets=144, pieces=4, rounds=20, gain=0.002, z=4, scale=2, together=True)
+"""Pixels may be missed, and the entries were cut to a prior: theta is narrow then, so that rounds are cheap, and z is left to find."""
 TURNED = Search(first=512, sets=512, pieces=4, rounds=40, gain=0.01, finest=4, z=2, scale=2, patience=2)
 """Pairs of borders tell nothing on a turned sensor: theta is cut, round by round, and the scale: some frames stay far wider without."""
 UNKNOWN = Search(first=512, sets=512, pieces=8, rounds=40, gain=0.005, finest=4, z=2, scale=2, patience=3)
