@@ -1,7 +1,6 @@
 """One drawn camera put to the test: the model of its scene built, and frames of it judged, most of them with an attitude.
 
-What counts as a finding is said in `random_scenes.trial`. A frame that the estimator refuses, as one with missed pixels of a turned camera
-behind a lens, is counted with the reason.
+What counts as a finding is said in `random_scenes.trial`. A frame that the estimator refuses is counted with the reason.
 """
 
 from __future__ import annotations
