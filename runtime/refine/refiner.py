@@ -86,8 +86,9 @@ FACES = 6
 NONE_MISSED = Search(first=48, sets=96, pieces=6, rounds=8, gain=0.06, z=2, scale=2)
 SOME_MISSED = Search(first=24, sets=216, pieces=4, rounds=20, gain=0.05, z=2, scale=2, together=True)
 """Missed pixels are counted where windows are a pixel or two wide (`missed`): then smaller pieces pay, cut along scale and z at once."""
-NARROWED = Search(first=4, sets=144, pieces=4, rounds=20, gain=0.002, z=4, scale=2, together=True)
-"""Pixels may be missed, and the entries were cut to a prior: theta is narrow then, so that rounds are cheap, and z is left to find."""
+NARROWED = Search(first=4, sets=144, pieces=4, rounds=20, gain=0.01, z=2, scale=2, patience=2, together=True)
+"""Pixels may be missed, and the entries were cut to a prior: theta is narrow then, so that rounds are cheap, and there is time for one
+without a gain, after which the pieces that carry the faces are small enough for the next one to tell more."""
 TURNED = Search(first=512, sets=512, pieces=4, rounds=40, gain=0.01, finest=4, z=2, scale=2, patience=2)
 """Pairs of borders tell nothing on a turned sensor: theta is cut, round by round, and the scale: some frames stay far wider without."""
 UNKNOWN = Search(first=512, sets=512, pieces=8, rounds=40, gain=0.005, finest=4, z=2, scale=2, patience=3)
