@@ -84,7 +84,7 @@ class Search:
 FACES = 6
 """Of the box in theta, y and z that is searched."""
 NONE_MISSED = Search(first=48, sets=96, pieces=6, rounds=8, gain=0.06, z=2, scale=2)
-SOME_MISSED = Search(first=24, sets=216, pieces=4, rounds=20, gain=0.05, z=2, scale=2, together=True)
+SOME_MISSED = Search(first=24, sets=216, pieces=6, rounds=20, gain=0.04, z=2, scale=2, together=True)
 """Missed pixels are counted where windows are a pixel or two wide (`missed`): then smaller pieces pay, cut along scale and z at once."""
 NARROWED = Search(first=4, sets=144, pieces=4, rounds=20, gain=0.01, z=2, scale=2, patience=2, together=True)
 """Pixels may be missed, and the entries were cut to a prior: theta is narrow then, so that rounds are cheap, and there is time for one
