@@ -84,11 +84,14 @@ class Search:
 FACES = 6
 """Of the box in theta, y and z that is searched."""
 NONE_MISSED = Search(first=48, sets=96, pieces=6, rounds=8, gain=0.06, z=2, scale=2)
-SOME_MISSED = Search(first=24, sets=216, pieces=6, rounds=20, gain=0.04, z=2, scale=2, together=True)
-"""Missed pixels are counted where windows are a pixel or two wide (`missed`): then smaller pieces pay, cut along scale and z at once."""
-NARROWED = Search(first=4, sets=144, pieces=4, rounds=20, gain=0.01, z=2, scale=2, patience=2, together=True)
-"""Pixels may be missed, and the entries were cut to a prior: theta is narrow then, so that rounds are cheap, and there is time for one
-without a gain, after which the pieces that carry the faces are small enough for the next one to tell more."""
+SOME_MISSED = Search(first=48, sets=144, pieces=6, rounds=20, gain=0.03, z=2, scale=2)
+"""Missed pixels are counted where windows are a pixel or two wide (`missed`): then smaller pieces pay, cut along the scale too."""
+NARROWED = Search(first=48, sets=144, pieces=6, rounds=20, gain=0.01, z=2, scale=2, patience=2)
+"""Pixels may be missed, and the entries were cut to a prior: they are few, so that there is time for small gains, and for a round without
+one, after which the pieces that carry the faces are small enough for the next one to tell more."""
+SOME_MISSED_X_KNOWN = replace(SOME_MISSED, first=24, sets=216, gain=0.04, together=True)
+NARROWED_X_KNOWN = replace(NARROWED, first=4, pieces=4, together=True)
+"""Where x is known theta needs fewer slices, and cutting scale and z at once tells more of z; where it is not, theta is worth the sets."""
 TURNED = Search(first=512, sets=512, pieces=4, rounds=40, gain=0.01, finest=4, z=2, scale=2, patience=2)
 """Pairs of borders tell nothing on a turned sensor: theta is cut, round by round, and the scale: some frames stay far wider without."""
 UNKNOWN = Search(first=512, sets=512, pieces=8, rounds=40, gain=0.005, finest=4, z=2, scale=2, patience=3)
@@ -131,7 +134,7 @@ class Refiner:
         witnesses = LitPixels.of(frame, self.window, beyond=True)
         vouched = None if vouched_pixels is None else Vouched(LitPixels.of(vouched_pixels, self.window, beyond=False), self.extra_budget)
         level = NONE_MISSED if flat else TURNED if self.optics is None or self.optics.calibration.exact else UNKNOWN
-        search = level if self.missed_budget == 0 else NARROWED if narrowed else SOME_MISSED
+        search = level if self.missed_budget == 0 else _search_with_missed(entries, narrowed)
         if not flat:
             entries = self._contracted(witnesses, vouched, entries)  # most contradict the frame as they are
             search = self._with_turns(search, entries) if entries.roll is not None else search
@@ -189,6 +192,12 @@ class Refiner:
         sets = contract_by_altitude(self.scene.camera, sets)
         empty = sets.empty
         return sets[~empty] if empty.any() else sets
+
+
+def _search_with_missed(entries: StateSet, narrowed: bool) -> Search:
+    if (entries.x[:, 0] < entries.x[:, 1]).any():
+        return NARROWED if narrowed else SOME_MISSED
+    return NARROWED_X_KNOWN if narrowed else SOME_MISSED_X_KNOWN
 
 
 def _parts(wanted: int, sets: int, least: int, finest: int) -> int:
