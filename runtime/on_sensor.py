@@ -105,7 +105,7 @@ def grouped(sets: StateSet, most: int) -> StateSet:
     if len(sets) <= most:
         return sets
     pitch, scale = (getattr(sets, name).mean(axis=1) for name in ("theta", "scale"))
-    pitch_step, scale_step = (float(np.median(np.ptp(getattr(sets, name), axis=1))) for name in ("theta", "scale"))
+    pitch_step, scale_step = (float(np.median(np.ptp(getattr(sets, name), axis=1))) or 1.0 for name in ("theta", "scale"))
     distance = np.unique(sets.z, axis=0, return_inverse=True)[1].ravel()
     place, row_step = np.zeros(len(sets), dtype=np.int64), FIRST_ROW_STEP
     for _ in range(MOST_DOUBLINGS):
