@@ -71,6 +71,11 @@ class StateSet:
         inverted = [side[:, 0] > side[:, 1] for side in (self.theta, self.x, self.y, self.z, self.scale)]
         return inverted[0] | inverted[1] | inverted[2] | inverted[3] | inverted[4]
 
+    @property
+    def x_known(self) -> bool:
+        """Is x one number in each of the sets, or none?"""
+        return not (self.x[:, 0] < self.x[:, 1]).any()
+
     def contracted(self, **bounds: tuple[Floats, Floats]) -> StateSet:
         """The sets with the named intervals (any but theta's) intersected with the bounds given for them, lower and upper, (sets,) each."""
         closer = {}

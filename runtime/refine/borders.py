@@ -96,7 +96,7 @@ def _columns(scene: Scene, sets: StateSet, ratio: Interval, margin_px: Floats) -
     slow, fast = sets.scale[:, 0] * ratio[0], sets.scale[:, 1] * ratio[1]
     first, last = across_low * slow, across_low * fast
     low = np.minimum(first, last)
-    if (sets.x[:, 0] < sets.x[:, 1]).any():
+    if not sets.x_known:
         first, last = across_high * slow, across_high * fast
     high = np.maximum(first, last, out=first)
     low += scene.camera.u0 - margin_px

@@ -43,6 +43,5 @@ def contract_by_offsets(sets: StateSet, sight: Sight) -> StateSet:
 def _may_tell(source: Callable[[StateSet, Sight], Interval], sets: StateSet, sight: Sight) -> bool:
     """Does the source tell what no other contractor does? With x known and none missed, what crossings tell is in the scales (`scales`)."""
     if source == offsets_at_crossings:
-        x_known = (sets.x[:, 0] == sets.x[:, 1]).all()
-        return not (isinstance(sight.borders, Borders) and x_known and (sight.missed.left <= 0).all())
+        return not (isinstance(sight.borders, Borders) and sets.x_known and (sight.missed.left <= 0).all())
     return source != offsets_by_vouched or sight.vouched is not None

@@ -195,9 +195,9 @@ class Refiner:
 
 
 def _search_with_missed(entries: StateSet, narrowed: bool) -> Search:
-    if (entries.x[:, 0] < entries.x[:, 1]).any():
-        return NARROWED if narrowed else SOME_MISSED
-    return NARROWED_X_KNOWN if narrowed else SOME_MISSED_X_KNOWN
+    if entries.x_known:
+        return NARROWED_X_KNOWN if narrowed else SOME_MISSED_X_KNOWN
+    return NARROWED if narrowed else SOME_MISSED
 
 
 def _parts(wanted: int, sets: int, least: int, finest: int) -> int:

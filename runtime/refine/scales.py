@@ -75,7 +75,7 @@ def scales_at_borders(sets: StateSet, sight: Sight, borders: Borders) -> Interva
             offset_low, offset_high = np.where(one_side, offset_low, 0.0), np.where(one_side, offset_high, np.inf)
         np.maximum(low, offset_low / far, out=low)
         np.minimum(high, offset_high / near, out=high)
-    if (sets.x[:, 0] < sets.x[:, 1]).any():
+    if not sets.x_known:
         x_m = sight.scene.runway.x_m
         for one, other in itertools.permutations(range(len(x_m)), 2):
             if x_m[one] < x_m[other]:
