@@ -186,13 +186,12 @@ class Turns:
     @staticmethod
     def of(seen_pitch: Floats, roll: Floats, yaw: Floats) -> Turns:
         """Of all states whose ideal frame shows a pitch c in `seen_pitch`, with roll and yaw in these intervals; (sets, 2) each, rad."""
-        cos_c, tan_c = _cosines(seen_pitch), _tangents(seen_pitch)
-        tan_b = _product((-cos_c[1], -cos_c[0]), _tangents(yaw))
-        low, high = np.minimum(*tan_b), np.maximum(*tan_b)
-        b = arctangent(low), arctangent(high)
+        cos_c, tan_c = _cosines_and_tangents(seen_pitch)
+        low, high = _product((-cos_c[1], -cos_c[0]), _tangents(yaw))
+        b = arctangent(np.stack([low, high]))
         sin_b = low / np.sqrt(1 + low * low), high / np.sqrt(1 + high * high)
         shift = _product(sin_b, tan_c)
-        shift = arctangent(lowered(shift[0], np.abs(shift[0]))), arctangent(raised(shift[1], np.abs(shift[1])))
+        shift = arctangent(np.stack([lowered(shift[0], np.abs(shift[0])), raised(shift[1], np.abs(shift[1]))]))
         a = shift[0] - roll[:, 1], shift[1] - roll[:, 0]
         (cos_a, sin_a), off_a = _middle(a, np.abs(shift[0]) + np.abs(shift[1]) + np.abs(roll).max(axis=1))
         (cos_b, sin_b0), off_b = _middle(b, np.abs(b[0]) + np.abs(b[1]))
@@ -250,17 +249,24 @@ def _middle(angle: Interval, terms: Floats) -> tuple[tuple[Floats, Floats], Floa
 
 def _cosines(angle: Floats) -> Interval:
     """Range of the cosine over intervals (sets, 2) within -pi/2 and pi/2."""
-    cosine = cosine_and_sine(angle)[0]
-    low, high = np.minimum(cosine[:, 0], cosine[:, 1]), np.maximum(cosine[:, 0], cosine[:, 1])
-    high = np.where((angle[:, 0] <= 0) & (angle[:, 1] >= 0), 1.0, high)
-    return lowered(low, low), raised(high, high)
+    return _cosines_and_tangents(angle)[0]
 
 
 def _tangents(angle: Floats) -> Interval:
     """Range of the tangent over intervals (sets, 2) within -pi/2 and pi/2."""
+    return _cosines_and_tangents(angle)[1]
+
+
+def _cosines_and_tangents(angle: Floats) -> tuple[Interval, Interval]:
+    """Both ranges."""
     cosine, sine = cosine_and_sine(angle)
     tangent = sine / cosine
-    return lowered(tangent[:, 0], np.abs(tangent[:, 0])), raised(tangent[:, 1], np.abs(tangent[:, 1]))
+    low, high = np.minimum(cosine[:, 0], cosine[:, 1]), np.maximum(cosine[:, 0], cosine[:, 1])
+    high = np.where((angle[:, 0] <= 0) & (angle[:, 1] >= 0), 1.0, high)
+    return (lowered(low, low), raised(high, high)), (
+        lowered(tangent[:, 0], np.abs(tangent[:, 0])),
+        raised(tangent[:, 1], np.abs(tangent[:, 1])),
+    )
 
 
 def _angles(tangent: Interval) -> Floats:

@@ -213,7 +213,7 @@ class Estimator:
         cell, support, mismatch, passes, lower, upper, filtered, network_state = outputs.values()
         network = np.where(self.scene.domain.fixed, self.domain.lower, network_state)
         if self.sensor.map is not None and turned is None:
-            filtered = own & self.sensor.seen_in(filtered.view(np.bool_))
+            filtered = self.sensor.within(filtered.view(np.bool_), own)
         return Found(own, int(cell), support, mismatch, passes, lower, upper, filtered, network, overflow, turned)
 
     def _run_by_theorem_a(self, pixels: NDArray[np.uint8], met_by_one: int) -> dict[str, Any]:

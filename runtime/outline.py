@@ -113,29 +113,36 @@ class Quadrilateral:
         slack = half * (1 + ROUNDING_SHARE) + 8 * ROUNDING_SHARE * (1 + float(np.abs(middle_s).max() + np.abs(middle_t).max()))
         return Quadrilateral(across, along, products.max(axis=0) + slack, products[np.arange(4), np.arange(4)] - slack)
 
-    def _products(self, s: Floats, t: Floats) -> Floats:
-        return s[..., None] * self.across + t[..., None] * self.along
-
     def beyond(self, s: Floats, t: Floats) -> Floats:
         """How far rays are at least from any ray of the window."""
-        return (self._products(s, t) - self.outer).max(axis=-1)
+        return (self._products(s, t) - _each(self.outer, s)).max(axis=0)
 
     def holds(self, s: Floats, t: Floats, off: Floats) -> Bits:
         """True for rays that lie in the window with all within `off` of them."""
-        return np.all(self._products(s, t) + off[..., None] < self.inner, axis=-1)
+        return np.all(self._products(s, t) + off < _each(self.inner, s), axis=0)
 
     def meets(self, low: tuple[Floats, Floats], high: tuple[Floats, Floats]) -> Bits:
         """False for boxes of rays that lie on the outer side of an edge."""
-        return np.all(self._extremes(np.minimum, low, high) <= self.outer, axis=-1)
+        return np.all(self._extremes(np.minimum, low, high) <= _each(self.outer, low[0]), axis=0)
 
     def holds_all(self, low: tuple[Floats, Floats], high: tuple[Floats, Floats]) -> Bits:
         """True for boxes of rays that lie in the window."""
-        return np.all(self._extremes(np.maximum, low, high) < self.inner, axis=-1)
+        return np.all(self._extremes(np.maximum, low, high) < _each(self.inner, low[0]), axis=0)
+
+    def _products(self, s: Floats, t: Floats) -> Floats:
+        """The product of each half-plane with rays of any shape, (4, ...)."""
+        return np.multiply.outer(self.across, s) + np.multiply.outer(self.along, t)
 
     def _extremes(self, extreme: np.ufunc, low: tuple[Floats, Floats], high: tuple[Floats, Floats]) -> Floats:
-        """The least or the largest product of a box's rays with each half-plane."""
-        s, t = (extreme(one * low[side][..., None], one * high[side][..., None]) for side, one in enumerate((self.across, self.along)))
+        """The least or the largest product of each half-plane with a box's rays, (4, ...)."""
+        sides = (self.across, low[0], high[0]), (self.along, low[1], high[1])
+        s, t = (extreme(np.multiply.outer(one, least), np.multiply.outer(one, most)) for one, least, most in sides)
         return s + t
+
+
+def _each(bounds: Floats, rays: Floats) -> Floats:
+    """Bounds of each half-plane, (4,), beside products with such rays."""
+    return bounds.reshape(-1, *[1] * rays.ndim)
 
 
 def _over_tiles(corners: Floats, extreme: np.ufunc) -> Floats:

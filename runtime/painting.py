@@ -77,13 +77,14 @@ class Painting:
             canvas[:] = 1
         return canvas[:-1].reshape(self.shape)
 
-    def seen_in(self, mask: Bits, shape: tuple[int, int]) -> Bits:
-        """The pixels of a sensor's frame of this shape that show some pixel of a mask of the ideal frame."""
-        flat = np.append(mask.ravel(), False)
-        seen = np.zeros(shape, dtype=bool)
-        rows, columns = (side.stop - side.start for side in self.window)
-        seen[self.window] = (flat[self.table].any(axis=1) | self.everything).reshape(rows, columns)
-        return seen
+    def within(self, mask: Bits, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """What a frame of the sensor has lit that shows some pixel of a mask of the ideal frame: uint8 of {0, 1}."""
+        rows, columns = np.nonzero(frame[self.window])
+        lit = rows * (self.window[1].stop - self.window[1].start) + columns
+        shows = np.append(mask.ravel(), False)[self.table[lit]].any(axis=1) | self.everything[lit]
+        within = np.zeros_like(frame)
+        within[self.window][rows[shows], columns[shows]] = 1
+        return within
 
 
 @dataclass(frozen=True)

@@ -71,9 +71,13 @@ class Sensor:
             return pixels
         return self.painting.painted(dilated(pixels.view(np.bool_), self.scene.tolerance.line_px))
 
+    def within(self, mask: Bits, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """What a frame of the sensor has lit that shows some pixel of a mask of the ideal one, uint8 of {0, 1}."""
+        return pixels & mask if self.painting is None else self.painting.within(mask, pixels)
+
     def seen_in(self, mask: Bits) -> Bits:
         """The pixels of the sensor's frame that show some pixel of a mask of the ideal one."""
-        return mask if self.painting is None else self.painting.seen_in(mask, self.scene.camera.shape)
+        return self.within(mask, np.ones(self.scene.camera.shape, dtype=np.uint8)).view(np.bool_)
 
     @property
     def unseen(self) -> Bits | None:

@@ -21,6 +21,8 @@ HALVINGS = 3
 """How often an arctangent's angle is halved before its series: to pi/16 at most."""
 ARCTANGENT_DEGREE = 13
 """Power of the tangent's square that the series ends with: what is left out is below 2^-60 of the first term for such an angle."""
+ARCTANGENT_COEFFICIENTS = [(-1) ** power / (2 * power + 1) for power in range(ARCTANGENT_DEGREE, -1, -1)]
+"""Of the series of atan(t)/t in the square of t, the last ones first."""
 
 
 def cosine_and_sine(angle: Floats) -> tuple[Floats, Floats]:
@@ -50,8 +52,8 @@ def arctangent(tangent: Floats) -> Floats:
     for _ in range(HALVINGS):
         half = half / (1 + np.sqrt(1 + half * half))
     square = half * half
-    series = np.full_like(square, (-1) ** ARCTANGENT_DEGREE / (2 * ARCTANGENT_DEGREE + 1))
-    for power in range(ARCTANGENT_DEGREE - 1, -1, -1):
+    series = np.full_like(square, ARCTANGENT_COEFFICIENTS[0])
+    for coefficient in ARCTANGENT_COEFFICIENTS[1:]:
         series *= square
-        series += (-1) ** power / (2 * power + 1)
+        series += coefficient
     return 2**HALVINGS * (half * series)
