@@ -325,7 +325,7 @@ def _text_strip(
     """Lines of text; `shown`: whether a mask and the runway's dark pixels are."""
     size = min(1.0, width / (2 * NARROWEST_PICTURE))
     strip = _canvas((TEXT_LINES + (over_time is not None)) * int(LINE_HEIGHT * size), width)
-    fallback = "estimate: box centre, as NN_e's state lies outside" if estimate.used_fallback else ""
+    fallback = "estimate: the box's centre" if estimate.used_fallback else ""
     boundary = "box reaches the domain's face" if estimate.touches_boundary else ""
     lines = [[(title, TEXT), _outcome(estimate), (_cells(scene, estimate), TEXT), (fallback, TEXT), (boundary, TEXT)], [], [], []]
     if estimate.box is not None:

@@ -100,7 +100,7 @@ SWAYING = Search(first=512, sets=512, pieces=16, rounds=80, gain=0.002, finest=2
 """Roll and yaw are known up to a plus-minus alone: half of it then tells more than half of a slice, and many pieces carry one face."""
 LEAST_SWAY_PX = 0.25
 """A plus-minus that moves no point of the frame by this much is not cut."""
-LARGEST_START = 512
+LARGEST_START = 2**12
 """More passing entries than this say that the frame tells next to nothing: they are left as they are, at a bounded cost."""
 LARGEST_SENSOR_START = 2**13
 """The same of a sensor's frame, whose entries are those of all bins of pitch, yaw and roll."""

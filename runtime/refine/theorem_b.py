@@ -11,7 +11,7 @@ from runtime.model.entries import Entries
 from runtime.refine.refiner import LARGEST_START, Refiner, joined
 from runtime.state_set import StateSet
 
-LEAST_SEARCH = 16
+LEAST_SEARCH = 2**7
 """A cell's search costs at least as much as so many entries: with many cells, fewer entries are refined (`LARGEST_START`)."""
 
 
