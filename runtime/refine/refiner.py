@@ -89,7 +89,7 @@ SOME_MISSED = Search(first=48, sets=144, pieces=6, rounds=20, gain=0.03, z=2, sc
 NARROWED = Search(first=48, sets=144, pieces=6, rounds=20, gain=0.01, z=2, scale=2, patience=2)
 """Pixels may be missed, and the entries were cut to a prior: they are few, so that there is time for small gains, and for a round without
 one, after which the pieces that carry the faces are small enough for the next one to tell more."""
-SOME_MISSED_X_KNOWN = replace(SOME_MISSED, first=24, sets=216, gain=0.08, together=True)
+SOME_MISSED_X_KNOWN = replace(SOME_MISSED, first=24, sets=216, gain=0.06, together=True)
 NARROWED_X_KNOWN = replace(NARROWED, first=4, pieces=4, together=True)
 """Where x is known theta needs fewer slices, and cutting scale and z at once tells more of z; where it is not, theta is worth the sets."""
 TURNED = Search(first=512, sets=512, pieces=4, rounds=40, gain=0.01, finest=4, z=2, scale=2, patience=2)
