@@ -11,13 +11,16 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from rational_image import RationalState, RationalView
 from scenes import examples
 from test_contractors import CONTRACTORS, WHOLE, Case, cases, clutter_of, spoiled, whole_markings
 from turned_state import TurnedState
 
 from runtime.refine.lit_pixels import LitPixels
+from runtime.refine.optics import Optics
 from runtime.refine.sensor_borders import SensorBorders
 from runtime.refine.sight import Sight
+from runtime.scene import Calibration
 
 Frame = NDArray[np.bool_]
 LARGEST_RAD = math.radians(10)
@@ -81,6 +84,36 @@ def test_ends_and_crossings_are_seen_where_the_borders_say(turned: TurnedCase) -
                 assert borders.columns[0][number, place, 0] <= column <= borders.columns[1][number, place, 0] + 1
             if borders.crossed[number, place, 0]:
                 assert far[1] < row < near[1]
+
+
+def aside(view: RationalView, state: RationalState, column: int, row: int) -> Fraction:
+    """How far across the runway, per metre of altitude, the ground lies that is shown in this corner of pixels."""
+    across, down = view.in_camera(replace(state, y=0), state.x + 1, -state.z), view.in_camera(replace(state, y=1), state.x, -state.z)
+    ray = (column - view.u0) / view.focal_u, (row - view.v0) / view.focal_v, Fraction(1)
+    right, fall = (sum(one * other for one, other in zip(axis, ray, strict=True)) for axis in (across, down))
+    return right / fall
+
+
+@pytest.mark.parametrize("calibration", [None, Calibration(), Calibration(roll_rad=1e-5)])
+@examples(20)
+@given(turned=turned(whole_markings()), share=st.floats(0, 1))
+def test_a_marking_through_a_corner_of_pixels_keeps_its_state(calibration: Calibration | None, turned: TurnedCase, share: float) -> None:
+    """It lights one pixel above the border and the one diagonally below; also read as behind a lens, and as of a camera that may be off."""
+    case, view = turned.case, turned.turned.view(turned.case.scene)
+    stripe, state = view.stripes[0], case.state
+    (near, far) = (view.project(state, stripe.x, z) for z in (stripe.near_z, stripe.far_z))
+    rows = range(math.floor(far[1]) + 2, math.ceil(near[1]) - 1)
+    assume(len(rows) > 0)
+    row = rows[int(share * (len(rows) - 1))]
+    column = round(far[0] + (near[0] - far[0]) * (row - far[1]) / (near[1] - far[1]))
+    state = replace(state, x=stripe.x - state.y * aside(view, state, column, row))
+    sets = replace(case.sets, x=float(state.x) + np.array([[-1.0, 1.0]]) * 2.0**-30)
+    case = replace(case, state=state, sets=sets, image=view.image(state).frame)
+    assert case.held_by(sets)
+    optics = None if calibration is None else Optics.of(case.scene.camera, calibration)
+    sight = Sight.of(case.scene, sets, LitPixels.of(case.image, WHOLE, beyond=True), 0, None, optics)
+    for contract in CONTRACTORS.values():
+        assert case.held_by(contract(sets, sight))
 
 
 @examples(60)

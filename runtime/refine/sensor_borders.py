@@ -126,13 +126,13 @@ class SensorBorders:
         sway = view.sway((left + right) / 2, tangent_v[None], np.abs(right - left) / 2).beside(self.point, camera, view)
         low = view.quotient(left, tangent_v, -margin, np.minimum) * camera.focal_u_px - sway
         high = view.quotient(right, tangent_v, margin, np.maximum) * camera.focal_u_px + sway
-        return _bounds_where(seen & rises, first > last, low, high)
+        return _bounds_where(seen & rises, _no_column(first, last), low, high)
 
     def _offsets_behind_lens(self, optics: Optics, first: Floats, last: Floats, row: Floats) -> Interval:
         """`offsets` by the rays of the corners of pixels, of a camera that is known exactly."""
         stretch = optics.between(first, last + 1, row)
         low, high = self._quotients(optics, stretch)
-        return _bounds_where(stretch.known & self.view.rises_along(optics, stretch), first > last, low, high)
+        return _bounds_where(stretch.known & self.view.rises_along(optics, stretch), _no_column(first, last), low, high)
 
     def sheared_offsets(self, first: Floats, last: Floats, rows: slice = slice(None)) -> tuple[Floats, Floats, Floats]:
         """Bounds on (p_x - x'') scale'' - kappa w of such markings, and w, where something is unknown of the camera (`unknowns`)."""
@@ -144,7 +144,7 @@ class SensorBorders:
         w, rest, known = unknowns.sheared_at(view, Moves.at(view, optics, *stretch.middle, stretch.reach))
         low, high = self._quotients(optics, stretch)
         known &= stretch.known & view.rises_along(optics, stretch)
-        return *_bounds_where(known, first > last, low - rest, high + rest), w
+        return *_bounds_where(known, _no_column(first, last), low - rest, high + rest), w
 
     def _quotients(self, optics: Optics, stretch: Stretch) -> Interval:
         """The smallest and the largest F s X/D at the ends of stretches."""
@@ -349,6 +349,14 @@ def _middle_point(camera: Camera, sets: StateSet, view: View, offset: Interval, 
     turns = view.turns
     x, z = turns.cos_b * aside + turns.sin_b, np.maximum(turns.cos_b - turns.sin_b * aside, LEAST_DEPTH)
     return ((turns.cos_a * x - turns.sin_a * down) / z)[None, None], ((turns.sin_a * x + turns.cos_a * down) / z)[None, None]
+
+
+def _no_column(first: Floats, last: Floats) -> Bits:
+    """True where the closed columns from `first` to `last` have no point in common.
+
+    Where `first` is the one behind `last` they have one: a marking through the corner of four pixels may light two of them, diagonally.
+    """
+    return first > last + 1
 
 
 def _bounds_where(bound: Bits, dark: Bits, low: Floats, high: Floats) -> Interval:
