@@ -194,7 +194,7 @@ class Turns:
         shift = arctangent(np.stack([lowered(shift[0], np.abs(shift[0])), raised(shift[1], np.abs(shift[1]))]))
         a = shift[0] - roll[:, 1], shift[1] - roll[:, 0]
         (cos_a, sin_a), off_a = _middle(a, np.abs(shift[0]) + np.abs(shift[1]) + np.abs(roll).max(axis=1))
-        (cos_b, sin_b0), off_b = _middle(b, np.abs(b[0]) + np.abs(b[1]))
+        (cos_b, sin_b0), off_b = _middle((b[0], b[1]), np.abs(b[0]) + np.abs(b[1]))
         return Turns(cos_a, sin_a, cos_b, sin_b0, off_a, off_b)
 
     @staticmethod

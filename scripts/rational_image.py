@@ -18,7 +18,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -188,6 +188,14 @@ class RationalView:
             cosine, sine = turn(self.roll)
             right, down = right * cosine - down * sine, right * sine + down * cosine
         return right, down, depth
+
+    def aside(self, state: RationalState, column: Fraction, row: Fraction) -> Fraction | None:
+        """How far to the right of the camera, per metre of its altitude, the ground lies that a pinhole shows there; None of the sky."""
+        along_x = self.in_camera(replace(state, y=Fraction(0)), state.x + 1, -state.z)
+        downward = self.in_camera(replace(state, y=Fraction(1)), state.x, -state.z)
+        ray = (column - self.u0) / self.focal_u, (row - self.v0) / self.focal_v, Fraction(1)
+        right, fall = (sum((one * other for one, other in zip(axis, ray, strict=True)), Fraction(0)) for axis in (along_x, downward))
+        return right / fall if fall > 0 else None
 
     def segments(self, state: RationalState) -> list[tuple[Point, Point]]:
         """The near and the far end of each marking in the image, as far as it lies in front of the camera."""

@@ -11,7 +11,6 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from rational_image import RationalState, RationalView
 from scenes import examples
 from test_contractors import CONTRACTORS, WHOLE, Case, cases, clutter_of, spoiled, whole_markings
 from turned_state import TurnedState
@@ -86,14 +85,6 @@ def test_ends_and_crossings_are_seen_where_the_borders_say(turned: TurnedCase) -
                 assert far[1] < row < near[1]
 
 
-def aside(view: RationalView, state: RationalState, column: int, row: int) -> Fraction:
-    """How far across the runway, per metre of altitude, the ground lies that is shown in this corner of pixels."""
-    across, down = view.in_camera(replace(state, y=0), state.x + 1, -state.z), view.in_camera(replace(state, y=1), state.x, -state.z)
-    ray = (column - view.u0) / view.focal_u, (row - view.v0) / view.focal_v, Fraction(1)
-    right, fall = (sum(one * other for one, other in zip(axis, ray, strict=True)) for axis in (across, down))
-    return right / fall
-
-
 @pytest.mark.parametrize("calibration", [None, Calibration(), Calibration(roll_rad=1e-5)])
 @examples(20)
 @given(turned=turned(whole_markings()), share=st.floats(0, 1))
@@ -106,7 +97,9 @@ def test_a_marking_through_a_corner_of_pixels_keeps_its_state(calibration: Calib
     assume(len(rows) > 0)
     row = rows[int(share * (len(rows) - 1))]
     column = round(far[0] + (near[0] - far[0]) * (row - far[1]) / (near[1] - far[1]))
-    state = replace(state, x=stripe.x - state.y * aside(view, state, column, row))
+    aside = view.aside(state, Fraction(column), Fraction(row))
+    assert aside is not None
+    state = replace(state, x=stripe.x - state.y * aside)
     sets = replace(case.sets, x=float(state.x) + np.array([[-1.0, 1.0]]) * 2.0**-30)
     case = replace(case, state=state, sets=sets, image=view.image(state).frame)
     assert case.held_by(sets)

@@ -26,7 +26,7 @@ from runtime import Attitude, Estimator
 CLUTTER = {"no clutter": 0.3, "clutter 0-2%": 0.25, "clutter 2-20%": 0.2, "second runway": 0.15, "other": 0.1}
 DENSITY = {"clutter 0-2%": (0.0, 0.02), "clutter 2-20%": (0.02, 0.2), "second runway": (0.0, 0.02)}
 OTHERS = (everything, longer_markings, neighbourhood)
-STATES = {"state anywhere": 0.5, "state on faces": 0.25, "an end on a border of rows": 0.25}
+STATES = {"state anywhere": 0.4, "state on faces": 0.2, "an end on a border of rows": 0.2, "a marking through a corner": 0.2}
 TURNED_ORDERS = {name: order for name, order in ORDERS.items() if name != "dark in K"}
 """K is of the ideal frame, which a turned camera does not show."""
 UNREFINED = 0.2
@@ -75,8 +75,8 @@ def draw_frame(rng: Rng, stage: Stage, estimator_of: Callable[[int], Estimator])
     seen = as_fixed(stage, (faces_if_any if kind == "state on faces" else uniform)(rng, stage))
     turned = TurnedState(seen, Fraction(0), Fraction(0)) if level else draw_turn(rng, seen, estimator.known_attitude(None))
     view = camera if level else turned.turned(camera)
-    if kind == "an end on a border of rows":
-        turned = on_a_border(rng, stage, turned, view)
+    if kind in MOVED:
+        turned = MOVED[kind](rng, stage, turned, view)
     told = draw_told(rng, estimator, turned, level)
     sights = [Sight(turned, view, stage.counted(view) if level else view)]
     picture, clutter = drawn(rng, stage, estimator, sights, told, level)
@@ -145,3 +145,30 @@ def on_a_border(rng: Rng, stage: Stage, state: TurnedState, view: RationalView) 
             if stage.contains(moved):
                 return replace(state, seen=moved)
     return state
+
+
+def through_a_corner(rng: Rng, stage: Stage, state: TurnedState, view: RationalView) -> TurnedState:
+    """The state with x, or y where x is known, so changed that a marking passes through the closest corner of pixels, or a hair beside it.
+
+    Behind a lens the corner is one of what a pinhole would show.
+    """
+    for _ in range(TRIES):
+        stripe = view.stripes[rng.integers(len(view.stripes))]
+        right, down, depth = view.in_camera(state.seen, stripe.x, stripe.near_z + (stripe.far_z - stripe.near_z) * Fraction(rng.random()))
+        if depth <= 0:
+            continue
+        column, row = round(view.u0 + view.focal_u * right / depth), round(view.v0 + view.focal_v * down / depth)
+        aside = view.aside(state.seen, Fraction(column), Fraction(row))
+        if aside is None or aside == 0:
+            continue
+        if stage.lower[1] < stage.upper[1]:
+            moved = replace(state.seen, x=stripe.x - state.seen.y * aside + nudge(rng))
+        else:
+            moved = replace(state.seen, y=(stripe.x - state.seen.x) / aside + nudge(rng))
+        if stage.contains(moved):
+            return replace(state, seen=moved)
+    return state
+
+
+MOVED = {"an end on a border of rows": on_a_border, "a marking through a corner": through_a_corner}
+"""What moves a state to where its kind says."""
