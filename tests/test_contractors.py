@@ -335,11 +335,11 @@ def test_two_borders_tell_the_horizon(data: st.DataObject) -> None:
     horizon, unit = data.draw(st.floats(-500, 500)), data.draw(spread(1e-3, 1e3))
     row = np.array(data.draw(st.lists(st.integers(1, 2000), min_size=2, max_size=9, unique=True)), dtype=np.float64)[:, None] - horizon
     scales = unit * (row + horizon)
-    least, most = horizon_bounds(row, scales, scales, np.array([[horizon - 0.4], [horizon + 0.4]]))
+    least, most = horizon_bounds(row, 0.0, scales, scales, np.array([[horizon - 0.4], [horizon + 0.4]]))
     assert least[0] <= horizon <= most[0]
     assert most[0] - least[0] <= 1e-6
     falling = -np.sort(-scales, axis=0)
-    assert horizon_bounds(np.sort(row, axis=0), falling, falling, np.array([[horizon], [horizon + 0.4]]))[1][0] < horizon
+    assert horizon_bounds(np.sort(row, axis=0), 0.0, falling, falling, np.array([[horizon], [horizon + 0.4]]))[1][0] < horizon
 
 
 @examples(60)

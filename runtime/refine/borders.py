@@ -63,9 +63,9 @@ class Borders:
 
         They mean nothing where a border is not crossed.
         """
-        slow, fast = (side[rows] for side in self.per_ratio)
+        per_low, per_high = (side[rows] for side in self.per_ratio)
         low, high = first - (scene.camera.u0 + self.margin_px), last + (1 - scene.camera.u0 + self.margin_px)
-        return np.minimum(low * slow, low * fast), np.maximum(high * slow, high * fast)
+        return np.minimum(low * per_low, low * per_high), np.maximum(high * per_low, high * per_high)
 
     def seen_x(self, sets: StateSet) -> Interval:
         """Range of the x that offsets refer to, (sets,), m: here the sets' own."""

@@ -36,12 +36,12 @@ def contract_by_scales(sets: StateSet, sight: Sight) -> StateSet:
         return sets
     camera = sight.scene.camera
     low, high = scales_at_borders(sets, sight, borders)
-    slow, fast = borders.per_ratio
-    least, most = np.maximum.reduce(low * fast, axis=0), np.minimum.reduce(high * slow, axis=0)
+    per_low, per_high = borders.per_ratio
+    least, most = np.maximum.reduce(low * per_high, axis=0), np.minimum.reduce(high * per_low, axis=0)
     contradicted = np.logical_or.reduce(low > high, axis=0)
     cosine, sine = (side.T for side in sets.turn)
     tangent = sine / cosine
-    lowest, highest = horizon_bounds(borders.row - camera.v0, low, high, camera.focal_v_px * tangent)
+    lowest, highest = horizon_bounds(borders.row, camera.v0, low, high, camera.focal_v_px * tangent)
     if not complete.all():
         least, most = np.where(complete, least, -np.inf), np.where(complete, most, np.inf)
         lowest, highest = np.where(complete, lowest, -np.inf), np.where(complete, highest, np.inf)
@@ -85,29 +85,30 @@ def scales_at_borders(sets: StateSet, sight: Sight, borders: Borders) -> Interva
     return np.maximum(lowered(low, low), 0), raised(high, np.abs(high))
 
 
-def horizon_bounds(row: Floats, low: Floats, high: Floats, horizon: Floats) -> Interval:
-    """Bounds on T, (sets,) each, of states with g between `low` and `high`, (rows, sets), at rows v - v0; inverted where there are none.
+def horizon_bounds(row: Floats, v0: float, low: Floats, high: Floats, horizon: Floats) -> Interval:
+    """Bounds on T, (sets,) each, of states with g between `low` and `high`, (rows, sets), at rows v; inverted where there are none.
 
     `horizon`: bounds on T, (2, sets), that leave all rows below the horizon at which g is bounded.
     """
     numbers = np.arange(len(horizon[0]))
-    depth = row + horizon[:, None]
+    depth = row - v0 + horizon[:, None]
     np.maximum(depth, OUTWARD_PX, out=depth)  # above the horizon, where nothing is known; it chooses the pairs, and bounds nothing
     one, other = (low / depth).argmax(axis=1), (high / depth).argmin(axis=1)
     under, over, start, stop = low[one, numbers], high[other, numbers], row[one, numbers], row[other, numbers]
-    apart = over - under
+    apart, start_depth = over - under, start - v0  # the difference of two rows is exact, that of two depths is not
     usable = (under > 0) & (over < np.inf) & (apart != 0)
     turn = under * (stop - start) / np.where(usable, apart, 1.0)
-    terms = np.abs(turn) + np.abs(start)
-    least = np.where(usable & (apart > 0), lowered(turn - start, terms), -np.inf)
-    most = np.where(usable & (apart < 0), raised(turn - start, terms), np.inf)
+    terms = np.abs(turn) + np.abs(start_depth)
+    least = np.where(usable & (apart > 0), lowered(turn - start_depth, terms), -np.inf)
+    most = np.where(usable & (apart < 0), raised(turn - start_depth, terms), np.inf)
     return np.maximum(*least), np.minimum(*most)
 
 
 def _least_turn(tangent: Floats, bound: Floats) -> Floats:
     """Lower bound on how far angles lie above that of `tangent`, if their tangents are at least `bound`; 0 where they may lie below.
 
-    atan(b) - atan(t) = atan((b - t) / (1 + b t)), and atan(s) >= s - s^3 / 3, which rises up to 1.
+    atan(b) - atan(t) = atan((b - t) / (1 + b t)), and atan(s) >= s - s^3 / 3, which rises up to 1. From s = 1 on, and where 1 + b t is not
+    above 0, so that the angle is a right one or more, that of s = 1 is taken, 2/3.
     """
     ahead = np.maximum(bound, tangent)
     rise, run = lowered(ahead - tangent, np.abs(ahead) + np.abs(tangent)), 1 + ahead * tangent

@@ -31,9 +31,9 @@ def offsets_by_vouched(sets: StateSet, sight: Sight) -> Interval:
     across_low, across_high = across(sight.scene, sets)
     rises, falls = across_low[:, None] >= 0, across_high[:, None] <= 0
     high, low = own.first + (1 - u0 + borders.margin_px), own.last - (u0 + borders.margin_px)
-    slow, fast = borders.per_ratio
-    high_start, high_stop = (np.maximum(high * slow[side], high * fast[side]) for side in (slice(-1), slice(1, None)))
-    low_start, low_stop = (np.minimum(low * slow[side], low * fast[side]) for side in (slice(-1), slice(1, None)))
+    per_low, per_high = borders.per_ratio
+    high_start, high_stop = (np.maximum(high * per_low[side], high * per_high[side]) for side in (slice(-1), slice(1, None)))
+    low_start, low_stop = (np.minimum(low * per_low[side], low * per_high[side]) for side in (slice(-1), slice(1, None)))
     usable = sight.crossed.all(axis=0) & ~own.dark & (rises | falls)
     high = np.where(usable, np.where(rises, high_start, high_stop), np.inf)
     low = np.where(usable, np.where(rises, low_stop, low_start), -np.inf)
