@@ -34,7 +34,9 @@ def script(name: str) -> ModuleType:
         return importlib.import_module(name)
 
 
-compare_codac, compare_opencv, comparison_frames = map(script, ("compare_codac", "compare_opencv", "comparison_frames"))
+compare_codac, compare_opencv, compare_rounds, comparison_frames = map(
+    script, ("compare_codac", "compare_opencv", "compare_rounds", "comparison_frames")
+)
 PRECISION = 0.15 * compare_codac.TYPICAL_HALF_WIDTHS
 
 
@@ -238,6 +240,29 @@ def test_specks_are_removed_and_markings_kept(paper_scene: Scene, random_states:
     specks = image.copy()
     specks[400, 100] = specks[400, 102] = 1
     assert (compare_opencv.without_specks(specks) == 255 * image).all()
+
+
+# --- rounds ---
+
+
+def test_each_round_leaves_a_smaller_box_and_the_refinement_as_it_was(estimator: Estimator, paper_scene: Scene) -> None:
+    before = [getattr(compare_rounds.refiner, name) for name in compare_rounds.SEARCHES]
+    ((_, frame),) = comparison_frames.draw_frames(paper_scene, 1, 0.01, 3)
+    spent, widths = compare_rounds.compared(estimator, [frame], [0, 1, 2])
+    assert (np.diff(widths[1:, 0], axis=0) <= 0).all()
+    assert (widths[1, 0] > 1.1 * widths[0, 0]).all()
+    assert np.isfinite(spent).all()
+    assert [getattr(compare_rounds.refiner, name) for name in compare_rounds.SEARCHES] == before
+
+
+def test_the_table_of_rounds_has_a_row_for_each(repository: Path) -> None:
+    app = typer.Typer()
+    app.command()(compare_rounds.main)
+    model = str(repository / "models" / "paper.onnx")
+    done = CliRunner().invoke(app, [model, "--frames", "1", "--missed-budget", "2", "--rounds", "1", "--rounds", "3"])
+    assert done.exit_code == 0, done.output
+    assert "2 of 2 pixels missed" in done.output
+    assert all(f"│ {name} " in done.output for name in ("as it is", "1", "3"))
 
 
 # --- commands ---
