@@ -56,7 +56,7 @@ def export_model(
         target /= f"{scene.stem}.onnx"
     console = terminal.console()
     with _interrupts_end_in_a_line(target):
-        loaded, may_take = _planned(console, scene, estimator is None, 1 if dask else jobs, memory_mb)
+        loaded, may_take = _planned(console, scene, estimator, 1 if dask else jobs, memory_mb)
         if dry_run:
             return
         report = _export(console, loaded, target, estimator=estimator, seed=seed, jobs=jobs, dask=dask, memory_mb=may_take)
@@ -89,23 +89,26 @@ def _interrupts_end_in_a_line(target: Path) -> Iterator[None]:
         signal.signal(signal.SIGINT, earlier)
 
 
-def _planned(console: Console, path: Path, trained: bool, jobs: int, memory_mb: float | None) -> tuple[Scene, float]:
-    """Reads the scene, prints what it takes to build, and refuses what takes more memory than it may, MB; returns both."""
+def _planned(console: Console, path: Path, estimator: str | None, jobs: int, memory_mb: float | None) -> tuple[Scene, float]:
+    """Reads the scene, and a given network, prints what it takes to build, and refuses what takes too much memory, MB."""
     from build_model.build_size import build_size, check_size, free_memory_mb
+    from build_model.user_network import EstimatorError, given_network
     from runtime.scene import Scene, SceneError
     from runtime.sensor import Sensor
 
     may_take = free_memory_mb() if memory_mb is None else memory_mb
     try:
         scene = Scene.load(path)
-        size = build_size(Sensor.of(scene).ideal, jobs, trained, may_take)
+        ideal = Sensor.of(scene).ideal
+        given_network(ideal, estimator)
+        size = build_size(ideal, jobs, estimator is None, may_take)
         console.print(f"{path}: what it takes, estimated before anything is built", markup=False, highlight=False, soft_wrap=True)
         table = Table(show_header=False)
         for name, value in {**size.rows(), "memory that it may take": f"{may_take:.0f} MB"}.items():
             table.add_row(name, value)
         console.print(table)
         check_size(scene, size, may_take)
-    except SceneError as error:
+    except (SceneError, EstimatorError) as error:
         fail(error)
     return scene, may_take
 

@@ -32,14 +32,13 @@ from build_model.assembly import assemble
 from build_model.bank_graph import GraphWriter
 from build_model.build_size import BuildTooLargeError, Ledger
 from build_model.calibration import check_calibration
-from build_model.constant_network import constant_network
 from build_model.filter_graph import filter_graph
 from build_model.filter_tables import BankTables
 from build_model.hough_bank import CellBank, cell_bank
 from build_model.paper.paper_bound import PaperBound, paper_bound
 from build_model.partition import partition
 from build_model.state_network import TrainingReport, domain_window, state_graph, train_state_network
-from build_model.user_network import bare, user_network
+from build_model.user_network import bare, given_network
 from build_model.window import Bits
 from build_model.window_bank import CellWindows, cell_windows
 from runtime.assumptions import assumptions
@@ -88,10 +87,6 @@ class _Stopwatch:
         self.seconds[name] = time.perf_counter() - start
 
 
-NO_ESTIMATOR = "none"
-"""In place of a network's file: no NN_e; `network_state` is the domain's centre."""
-
-
 def _silent(_stage: str, _done: int, _total: int, _loss: float | None) -> None:
     pass
 
@@ -117,6 +112,7 @@ def export_model(
     watch = _Stopwatch()
     sensor = Sensor.of(scene)
     ideal = sensor.ideal
+    given = given_network(ideal, estimator)
     with watch.stage("NN_F"):
         if not ideal.calibration.exact:
             check_calibration(ideal, domain_window(ideal))  # of the tables' window again below: this spares a build in vain
@@ -125,7 +121,7 @@ def export_model(
         shift_px = check_calibration(ideal, tables.window)
         filter_part = filter_graph(ideal, tables)
     with watch.stage("NN_e"):
-        network, report = _state_network(sensor, filter_part, estimator, seed, progress)
+        network, report = (given, None) if given is not None else _trained_network(sensor, filter_part, seed, progress)
     with watch.stage("file"):
         graph = _joined(filter_part, network)
         bounds = paper_bounds(ideal, jobs, dask)
@@ -225,16 +221,9 @@ def filter_function(filter_part: onnx.GraphProto) -> Callable[[NDArray[np.uint8]
     return lambda frames: np.stack(list(pool.map(filtered, frames)))
 
 
-def _state_network(
-    sensor: Sensor, filter_part: onnx.GraphProto, estimator: str | Path | None, seed: int, progress: Progress
-) -> tuple[onnx.GraphProto, TrainingReport | None]:
-    """NN_e as a graph: none but a constant, the user's, or one trained on what NN_F lets through."""
-    scene = sensor.ideal
-    if estimator == NO_ESTIMATOR:
-        return constant_network(scene), None
-    if estimator is not None:
-        return user_network(scene, Path(estimator)), None
-    network, report = train_state_network(scene, filter_function(filter_part), seed, progress, sensor)
+def _trained_network(sensor: Sensor, filter_part: onnx.GraphProto, seed: int, progress: Progress) -> tuple[onnx.GraphProto, TrainingReport]:
+    """NN_e as a graph, trained on what NN_F lets through."""
+    network, report = train_state_network(sensor.ideal, filter_function(filter_part), seed, progress, sensor)
     return state_graph(network, OPSET).graph, report
 
 

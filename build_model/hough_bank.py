@@ -278,7 +278,8 @@ def _demand_strong(scene: Scene, entries: Entries) -> None:
         low, high = entries.states.lower[weak[0]], entries.states.upper[weak[0]]
         pixels = int(entries.must_light.sizes(len(entries))[weak[0]])
         where = ", ".join(f"{name} {a:.4g}..{b:.4g}" for name, a, b in zip(STATE_NAMES, low, high, strict=True))
+        budget = scene.tolerance.missed_budget
         raise SceneError(
-            f"bank: in {where}, only {pixels} pixels are lit by all states of a small part, which does "
-            f"not exceed missed_budget {scene.tolerance.missed_budget}; keep the runway in view there, or lower the budget"
+            f"bank: in {where}, only {pixels} pixels are lit by all states of a small part, which does not exceed missed_budget "
+            f"{budget}; keep the runway in view there{', or lower the budget' if budget else ''}"
         )

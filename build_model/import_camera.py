@@ -200,6 +200,9 @@ def _camera(
     size: tuple[int, int] | None, intrinsics: tuple[float, ...], key: str, model: str | None, coefficients: list[float], wanted: Wanted
 ) -> Camera:
     """The camera with these numbers (fx, fy, cx, cy), counted from pixel centres."""
+    if wanted.size is not None and size not in (None, wanted.size):
+        given, stated = ("x".join(map(str, each)) for each in (wanted.size, size))
+        raise CalibrationFileError(f"--size: found {given} for a calibration of {stated}; leave it out, or give that frame's calibration")
     size = wanted.size or size
     if size is None:
         raise CalibrationFileError("image_width, image_height: found nothing; give the frame's size with --size WIDTHxHEIGHT")

@@ -9,6 +9,7 @@ import onnx
 import onnx.version_converter
 from onnx import TensorProto, helper, numpy_helper
 
+from build_model.constant_network import constant_network
 from runtime.errors import one_line
 from runtime.model.format import OPSET, ModelError
 from runtime.model.onnx_subset import check_graph
@@ -26,6 +27,20 @@ AXES = Attribute(tuple, None, -LARGEST_RANK, LARGEST_RANK - 1)
 
 class EstimatorError(ValueError):
     """A user's network that cannot serve as NN_e."""
+
+
+NO_ESTIMATOR = "none"
+"""In place of a network's file: no NN_e; `network_state` is NaN, and the box's centre the estimate."""
+
+
+def given_network(scene: Scene, estimator: str | Path | None) -> onnx.GraphProto | None:
+    """NN_e as a graph where it is not to be trained: the user's, or a constant that stands for none.
+
+    Raises `EstimatorError` for a network that does not fit.
+    """
+    if estimator is None:
+        return None
+    return constant_network(scene) if estimator == NO_ESTIMATOR else user_network(scene, Path(estimator))
 
 
 def user_network(scene: Scene, path: Path) -> onnx.GraphProto:

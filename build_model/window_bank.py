@@ -365,5 +365,5 @@ def _demand_strong(groups: _Groups, missed_budget: int) -> None:
         where = ", ".join(f"{name} {a:.4g}..{b:.4g}" for name, a, b in zip(STATE_NAMES, low.min(axis=0), high.max(axis=0), strict=True))
         raise SceneError(
             f"bank: in {where}, all states of a small part cross {weakest[weak[0]]} windows in view, which does not exceed missed_budget "
-            f"{missed_budget}; keep the runway in view there, raise bank.rows, or lower the budget"
+            f"{missed_budget}; keep the runway in view there, or raise bank.rows{', or lower the budget' if missed_budget else ''}"
         )

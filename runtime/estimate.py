@@ -107,7 +107,7 @@ class Estimate:
     used_fallback: bool
     """True if the centre was taken."""
     network_state: NDArray[np.float64]
-    """NN_e's answer, uncertified."""
+    """NN_e's answer, uncertified; NaN of a model without one."""
     cell: int
     """The cell with the most consistent entries, or with the smallest mismatch where none is consistent."""
     passing: NDArray[np.int64]

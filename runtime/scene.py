@@ -483,7 +483,10 @@ def _kind_meant(kinds: list[Any], table: Any, key: str) -> Any:
     *others, last = (f"{{ {', '.join(names)} }}" for names in keys.values())
     known = isinstance(table, dict) and any(name in table for names in keys.values() for name in names)
     _demand(known, key, repr(table), f"give {', '.join(others)} or {last}")
-    return max(kinds, key=lambda kind: sum(name in table for name in keys[kind]))
+    meant = max(kinds, key=lambda kind: sum(name in table for name in keys[kind]))
+    strays = [name for name in table if name not in keys[meant] and any(name in names for names in keys.values())]
+    _demand(not strays, key, f"{', '.join(strays)} in a table of the other kind", f"give {', '.join(others)} or {last}, no keys of both")
+    return meant
 
 
 def _read_table(kind: Any, table: Any, key: str) -> Any:

@@ -26,8 +26,9 @@ from matplotlib.ticker import NullLocator
 from numpy.typing import NDArray
 from rich.table import Table
 
-from build_model.export import NO_ESTIMATOR, ExportReport, export_model
+from build_model.export import ExportReport, export_model
 from build_model.hough_bank import mask_bank
+from build_model.user_network import NO_ESTIMATOR
 from runtime import Estimator, Scene, terminal
 from runtime.domain import Edges, Growth
 from runtime.errors import fail

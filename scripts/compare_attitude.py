@@ -99,7 +99,8 @@ def loaded(model: Path | None, camera: str) -> Estimator:
     """The model, or that of `free_scene`, without NN_e."""
     if model is not None:
         return Estimator.load(model)
-    from build_model.export import NO_ESTIMATOR, export_model
+    from build_model.export import export_model
+    from build_model.user_network import NO_ESTIMATOR
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "free.onnx"

@@ -376,9 +376,9 @@ def undistortion(scene: Scene, ideal: Scene) -> Callable[[Frame], Frame]:
 
 
 def has_network(estimator: Estimator) -> bool:
-    """True unless the model's NN_e says the domain's centre of a dark frame, as the one does that stands for none."""
+    """True unless the model's NN_e says NaN of a dark frame, as the one does that stands for none."""
     dark = np.zeros(estimator.scene.camera.shape, dtype=np.uint8)
-    return not np.allclose(estimator.estimate(dark, refine=False).network_state, estimator.domain.centre, rtol=1e-6)
+    return bool(np.isfinite(estimator.estimate(dark, refine=False).network_state).all())
 
 
 def answers_of(

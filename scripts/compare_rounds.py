@@ -65,7 +65,7 @@ def timed(estimator: Estimator, frame: NDArray[np.uint8]) -> tuple[float, Floats
 
 
 def compared(estimator: Estimator, frames: list[NDArray[np.uint8]], rounds: list[int]) -> tuple[Floats, Floats]:
-    """Seconds, (1 + rounds, frames), of the refinement as it is and with at most so many rounds, and half-widths, (1 + rounds, frames, 3)."""
+    """Seconds, (1 + rounds, frames), as it is and with at most so many rounds, and half-widths, (1 + rounds, frames, 3)."""
     spent, widths = np.full((1 + len(rounds), len(frames)), np.inf), np.empty((1 + len(rounds), len(frames), len(FREE)))
     for number, frame in enumerate(track(frames, "frames", console=terminal.console(stderr=True), transient=True)):
         for _ in range(REPEATS):

@@ -420,9 +420,9 @@ def add_test(page: Page, estimator: Estimator, test: Test) -> None:
 
 
 def add_hough(page: Page, scene: Scene, test: Test, flight: Flight) -> None:
-    """Fig. 7: the standard Hough transform on the same frame, and the counts over all frames."""
+    """Fig. 7: Hough lines on the same frame, and the counts over all frames."""
     picture, false, right = hough_picture(scene, test)
-    page.heading("A standard Hough transform on the frame of Test 1")
+    page.heading("Hough lines on the frame of Test 1")
     caption = f"OpenCV's HoughLinesP: {false} false lines (dashed red), {right} on the runway (green); our estimate's markings in magenta."
     page.figure("hough", picture, caption)
     lines, missing = np.array(flight.false_lines), np.array(flight.missing)
@@ -458,6 +458,9 @@ def run_rows(runs: Sequence[dict[str, Any]]) -> list[list[object]]:
         for key, text in (("mean_error", "mean error"), ("largest_error", "largest error")):
             rows.append([f"{name}, {text}: θ rad, y m, z m", *(_by_axis(run[kind][key]) for run in runs)])
     rows.append(["half-widths of the box, means: θ rad, y m, z m", *(_by_axis(run["mean_half_widths"]) for run in runs)])
+    if any("tracked" in run for run in runs):
+        for key, text in (("mean_half_widths", "half-widths, means"), ("mean_error", "mean error"), ("largest_error", "largest error")):
+            rows.append([f"over time, {text}: θ rad, y m, z m", *(_by_axis(run.get("tracked", {}).get(key)) for run in runs)])
     rows.append(["ms a window, mean", *(f"{run['milliseconds_a_window']['mean']:.1f}" for run in runs)])
     return rows
 

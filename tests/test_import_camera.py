@@ -237,6 +237,13 @@ def test_what_a_file_lacks_is_taken_from_the_caller(tmp_path: Path) -> None:
     assert import_camera(written(tmp_path, text), Wanted(model="fisheye", size=(640, 480))) == FISHEYE
 
 
+def test_a_frame_of_another_size_than_the_files_is_refused(tmp_path: Path) -> None:
+    """Its principal point would be elsewhere."""
+    with pytest.raises(CalibrationFileError, match=r": --size: found 1280x720 for a calibration of 640x480; leave it out"):
+        import_camera(written(tmp_path, ROS), Wanted(size=(1280, 720)))
+    assert import_camera(written(tmp_path, ROS), Wanted(size=(640, 480))) == SEEN
+
+
 def test_the_command(tmp_path: Path) -> None:
     program = "from build_model.cli import import_camera_command; import_camera_command()"
 

@@ -35,6 +35,7 @@ from runtime.recordings.gyroscope import COLUMNS as GYROSCOPE_COLUMNS
 from runtime.recordings.history import MOST_MOMENTS, History, Moment, draw_history
 from runtime.recordings.recording import EVENT
 from runtime.recordings.report import COLUMNS, TRACKED_COLUMNS, TRACKED_INSIDE, TRUTH_COLUMNS
+from runtime.recordings.tally import Tally
 from runtime.recordings.truth import Truth, TruthError
 from runtime.recordings.video import is_whole
 
@@ -557,8 +558,17 @@ def test_windows_are_certified_over_time_too(recording, truth, tmp_path):
     assert (widths(rows, "tracked_") <= widths(rows, "") * 1.2).all()
     assert np.median(widths(rows, "tracked_")) < 0.9 * np.median(widths(rows, ""))
     assert (summary["tracked"]["certified"], summary["tracked"]["inside"]) == (WINDOWS - 1, WINDOWS - 1)
-    assert "over time" in done.stdout
+    assert 0 < summary["tracked"]["mean_error"]["theta_rad"] <= widths(rows, "tracked_").max()
+    assert "over time: error, mean / largest" in done.stdout
     assert "the state moves by theta -0.2 to 0.2 rad/s" in " ".join(done.stdout.split())
+
+
+def test_means_of_nothing_are_none() -> None:
+    tally = Tally(0, 1)
+    tally.followed["no runway"] += 1
+    assert (
+        tally.table()["mean_half_widths"] is tally.table()["tracked"]["mean_half_widths"] is tally.table()["tracked"]["mean_error"] is None
+    )
 
 
 def test_the_picture_shows_the_estimate_within_the_narrower_band(recording, truth, tmp_path, monkeypatch):

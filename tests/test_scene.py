@@ -164,6 +164,7 @@ BAD_VALUES: list[tuple[KeyPath, Any, str]] = [
     ((*MARKING, "length_m"), ABSENT, "runway.markings[0].length_m: found nothing"),
     (("domain", "y_m"), ABSENT, "domain.y_m: found nothing"),
     (("bank", "column_px"), ABSENT, "bank.column_px: found nothing"),
+    (("bank", "set_px"), 30.0, "bank: found set_px in a table of the other kind; give { pitch_bins"),
     # wrong types
     (("camera",), 3, "camera: found 3; give a table"),
     (("camera", "width"), 640.0, "camera.width: found 640.0; give a whole number"),

@@ -14,7 +14,8 @@ from rational_image import RationalState, RationalView
 from scenes import AIRPORT, CUT_LEFT, FREE_X, ONE_CELL, PAPER, STRIP
 from turned_state import TurnedState
 
-from build_model.export import NO_ESTIMATOR, export_model
+from build_model.export import export_model
+from build_model.user_network import NO_ESTIMATOR
 from runtime import Attitude, Box, Estimator, Motion, Outcome, Scene, Tracker
 from runtime.attitude import Turns
 from runtime.on_sensor import grouped

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from runtime import terminal
 from runtime.errors import INTERRUPTED, complain, fail
+from runtime.estimate import Outcome
 from runtime.estimator import Estimator
 from runtime.frames import LARGEST_GAP_US, EventError, FrameStream
 from runtime.model.format import ModelError
@@ -193,7 +194,6 @@ def _print_summary(console: Console, folder: Path, summary: dict[str, Any], unju
     table = Table(title=str(folder), title_justify="left", show_header=False)
     table.add_column(no_wrap=True)
     table.add_column(overflow="fold")
-    half_widths = ", ".join(f"{name} {value:.4f}" for name, value in summary["mean_half_widths"].items())
     rows = {
         "recording read as": summary["layout"],
         "windows": summary["windows"],
@@ -202,14 +202,14 @@ def _print_summary(console: Console, folder: Path, summary: dict[str, Any], unju
         **_explained(summary.get("no_runway_explained")),
         "fallback to the box's centre": summary["fallback"],
         "box reaches the domain's face": summary["touches_boundary"],
-        "half-widths, mean": half_widths if summary["certified"] else "-",
+        "half-widths, mean": _by_axis(summary["mean_half_widths"]),
         "ms a window, mean / largest": "{mean:.2f} / {largest:.2f}".format(**summary["milliseconds_a_window"]),
     }
     rows |= _tracked(summary.get("tracked"))
     rows |= {"assumptions hold": "not told: of a camera that rolls or yaws the truth tells no pixels"} if unjudged else {}
     for kind, name in (("assumptions_hold", "assumptions hold"), ("assumptions_broken", "assumptions broken")):
         if kind in summary:
-            rows |= _judged(name, summary[kind])
+            rows |= _judged(f"{name}, the frame alone" if "tracked" in summary else name, summary[kind])
     for name, value in rows.items():
         table.add_row(name, str(value))
     console.print(table)
@@ -222,11 +222,22 @@ def _tracked(followed: dict[str, Any] | None) -> dict[str, str]:
     """Rows on what a tracker made of the windows."""
     if followed is None:
         return {}
-    counts = ", ".join(f"{count} {name}" for name, count in followed.items() if name not in ("mean_half_widths", "inside", "outside"))
+    counts = ", ".join(f"{followed[name]} {name}" for name in (outcome.value for outcome in Outcome) if name in followed)
     if "inside" in followed or "outside" in followed:
         counts += f"; truth inside {followed.get('inside', 0)}, outside {followed.get('outside', 0)}"
-    half_widths = ", ".join(f"{name} {value:.4f}" for name, value in followed["mean_half_widths"].items())
-    return {"over time": counts, "over time: half-widths, mean": half_widths}
+    return {"over time": counts, "over time: half-widths, mean": _by_axis(followed["mean_half_widths"])} | _errors("over time", followed)
+
+
+def _by_axis(numbers: dict[str, float] | None) -> str:
+    return "-" if numbers is None else ", ".join(f"{name} {value:.4f}" for name, value in numbers.items())
+
+
+def _errors(name: str, counts: dict[str, Any]) -> dict[str, str]:
+    """A row on the errors, where a truth is known."""
+    if counts["mean_error"] is None:
+        return {}
+    sizes = zip(counts["mean_error"].items(), counts["largest_error"].values(), strict=True)
+    return {f"{name}: error, mean / largest": ", ".join(f"{column} {mean:.4f} / {largest:.4f}" for (column, mean), largest in sizes)}
 
 
 def _explained(lacking: dict[str, Any] | None) -> dict[str, str]:
@@ -249,10 +260,7 @@ def _explained(lacking: dict[str, Any] | None) -> dict[str, str]:
 def _judged(name: str, counts: dict[str, Any]) -> dict[str, str]:
     """Rows on the windows with a truth."""
     rows = {name: "{windows} windows: {inside} with the truth inside, {outside} outside, {no_runway} no runway".format(**counts)}
-    if counts["mean_error"] is not None:
-        sizes = zip(counts["mean_error"].items(), counts["largest_error"].values(), strict=True)
-        rows[f"{name}: error, mean / largest"] = ", ".join(f"{column} {mean:.4f} / {largest:.4f}" for (column, mean), largest in sizes)
-    return rows
+    return rows | _errors(name, counts)
 
 
 def run_model_command() -> None:

@@ -20,6 +20,11 @@ def by_column(values: NDArray[np.float64]) -> dict[str, float]:
     return dict(zip(STATE_COLUMNS, values.tolist(), strict=True))
 
 
+def mean_of(total: NDArray[np.float64], count: int) -> dict[str, float] | None:
+    """The mean of a sum of states' numbers (4,), for JSON; None of none."""
+    return by_column(total / count) if count else None
+
+
 @dataclass
 class Errors:
     """Sizes of errors, axis by axis, (4,) each, rad and m."""
@@ -36,9 +41,7 @@ class Errors:
 
     def table(self) -> dict[str, Any]:
         """Means and largest, for JSON; None where there is no error."""
-        if self.count == 0:
-            return {"mean_error": None, "largest_error": None}
-        return {"mean_error": by_column(self.total / self.count), "largest_error": by_column(self.largest)}
+        return {"mean_error": mean_of(self.total, self.count), "largest_error": by_column(self.largest) if self.count else None}
 
 
 @dataclass
@@ -89,14 +92,16 @@ class Tally:
     followed: Counter[str] = field(default_factory=Counter)
     """Of the windows that a tracker followed: their outcomes, and where a truth is known, whether the box has it."""
     followed_half_widths: NDArray[np.float64] = field(default_factory=lambda: np.zeros(4))
+    followed_errors: Errors = field(default_factory=Errors)
 
     def follow(self, tracked: Estimate, truth: NDArray[np.float64] | None) -> None:
         """Counts what a tracker made of one window, whose true state is known or not."""
         self.followed[tracked.outcome.value] += 1
         if tracked.box is not None:
             self.followed_half_widths += tracked.box.half_widths
-            if truth is not None:
+            if truth is not None and tracked.state is not None:
                 self.followed["inside" if tracked.box.contains(truth) else "outside"] += 1
+                self.followed_errors.add(tracked.state - truth)
 
     def add(self, estimate: Estimate, milliseconds: float, judgement: Judgement | None, explanation: Explanation | None) -> None:
         """Counts one window."""
@@ -120,14 +125,14 @@ class Tally:
 
     def table(self) -> dict[str, Any]:
         """Counts and means, for JSON."""
-        windows, certified = max(self.counts["windows"], 1), max(self.counts["certified"], 1)
+        windows = max(self.counts["windows"], 1)
         found: dict[str, Any] = {name: self.counts[name] for name in ("windows", "certified", "fallback", "touches_boundary")}
         found["no_runway"] = self.counts["windows"] - self.counts["certified"]
-        found["mean_half_widths"] = by_column(self.half_widths / certified)
+        found["mean_half_widths"] = mean_of(self.half_widths, self.counts["certified"])
         found["milliseconds_a_window"] = {"mean": self.milliseconds / windows, "largest": self.slowest_ms}
         if self.followed:
-            boxes = max(self.followed["certified"], 1)
-            found["tracked"] = {**self.followed, "mean_half_widths": by_column(self.followed_half_widths / boxes)}
+            widths = mean_of(self.followed_half_widths, self.followed["certified"])
+            found["tracked"] = {**self.followed, "mean_half_widths": widths, **self.followed_errors.table()}
         if self.lacking.reasons:
             found["no_runway_explained"] = self.lacking.table(self.missed_budget, self.largest_budget)
         if self.counts["judged"]:

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from rational_image import RationalState, RationalView
 
 from build_model.calibration import displacement_px
-from build_model.export import NO_ESTIMATOR, export_model
+from build_model.export import export_model
 from build_model.partition import partition
 from build_model.spatial_filter import spatial_filter
+from build_model.user_network import NO_ESTIMATOR
 from build_model.window import Window
 from runtime import Scene
 from runtime.domain import AnyAxis, Axis, Domain, Edges

@@ -8,7 +8,8 @@ from pathlib import Path
 from coverage.frames import bank_of
 from coverage.states import Stage, estimator_of, image_of, spatial_mask
 
-from build_model.export import NO_ESTIMATOR, export_model
+from build_model.export import export_model
+from build_model.user_network import NO_ESTIMATOR
 from random_scenes.scenes import DrawnScene
 
 

@@ -220,6 +220,7 @@ def test_a_dry_run_tells_what_a_scene_takes_and_builds_nothing(run: Run, scene_f
     ):
         assert text in result.stdout
     assert "NN_e" not in run(scene_file.name, "--dry-run", "--estimator", "none").stdout
+    fails_with(run(scene_file.name, "--dry-run", "--estimator", "net.onnx"), "net.onnx: cannot be read")
     assert models_in(tmp_path) == set()
     assert not (tmp_path / "out").exists()
 
