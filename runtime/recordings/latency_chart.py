@@ -35,7 +35,9 @@ LETTERS = 110
 
 @with_own_settings
 def latency_chart(header: Mapping[str, str], rows: Sequence[Latency]) -> Picture:
-    """Milliseconds a frame on a logarithmic scale, a panel for each kind of frames: bars to p50, marks at p99. (height, `WIDTH_PX`, 3)."""
+    """Milliseconds a frame on a logarithmic scale, a panel for each kind of frames: bars to p50, marks at p99, both as numbers; (height,
+    `WIDTH_PX`, 3).
+    """
     kinds = list(dict.fromkeys(row.frames for row in rows))
     panels_in = [PANEL_IN + ROW_IN * sum(row.frames == kind for row in rows) for kind in kinds]
     figure = new_figure(FRAME_IN + sum(panels_in), WIDTH_PX)
@@ -66,7 +68,7 @@ def _draw_panel(panel: Axes, kind: str, rows: Sequence[Latency]) -> None:
     panel.plot([row.p99_ms for row in rows], places, color=rgb(RED), linewidth=0, marker="|", markersize=9, markeredgewidth=1.5)
     for place, row in zip(places, rows, strict=True):
         text = {"va": "center", "fontsize": SMALL_PT, "color": rgb(INK)}
-        panel.annotate(f"{row.p50_ms:#.3g} ms", (row.p99_ms, place), (6, 0), textcoords="offset points", **text)
+        panel.annotate(f"{row.p50_ms:#.3g}, {row.p99_ms:#.3g} ms", (row.p99_ms, place), (6, 0), textcoords="offset points", **text)
     panel.set_yticks(places, [row.method for row in rows])
     panel.tick_params(axis="y", length=0)
     panel.grid(axis="x", color=rgb(PALE), linewidth=0.5)
