@@ -177,7 +177,8 @@ class Estimator:
         `refine`: contract the passing entries to what the frame can tell (`runtime.refine`); without it, the box is their hull. `prior`: a
         box that is known to hold the state (Theorem C); if it contradicts a frame which has a state without it, the outcome is
         INCONSISTENT. `attitude`: roll and yaw of the camera, by default the scene's; the frame is its sensor's own (`runtime.turned`), and
-        Theorem A alone is used. Raises `FrameError` for any other frame and ValueError for a proposal of another shape.
+        Theorem A alone is used. Raises `FrameError` for any other frame, and ValueError for a proposal of another shape and a prior that is
+        no box.
         """
         state = None if proposal is None else self._checked_proposal(proposal)
         attitude = self.known_attitude(attitude)
@@ -225,6 +226,8 @@ class Estimator:
         """The part of a box, of the camera's pitch, that lies in the domain, of the ideal frame's; None where there is none."""
         if box is None:
             return self.domain
+        if not isinstance(box, Box):
+            raise ValueError(f"prior: found {type(box).__name__}; give a runtime.Box, or None")
         if attitude is not None:
             box = seen_box(box, attitude)
         low, high = np.maximum(box.lower, self.domain.lower), np.minimum(box.upper, self.domain.upper)

@@ -237,6 +237,8 @@ def test_a_proposal_that_is_no_number_gives_way_to_the_centre(paper: Estimator, 
 def test_a_proposal_of_another_shape_is_refused(paper: Estimator, proposal: object) -> None:
     with pytest.raises(ValueError, match=r"^proposal: found shape .*, expected \(4,\): theta, x, y, z$"):
         paper.estimate(runway_image(PAPER, MIDDLE), proposal=proposal)  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"^prior: found list; give a runtime\.Box"):
+        paper.estimate(np.zeros((480, 640), dtype=bool), prior=[0, 1])  # pyright: ignore[reportArgumentType]
 
 
 def test_a_proposal_without_a_runway_is_not_believed(paper: Estimator) -> None:

@@ -108,7 +108,5 @@ def test_files_that_cannot_be_used_are_refused(tmp_path: Path, rows: list, found
     with pytest.raises(GyroscopeError, match=found):
         GyroscopeReadings.load(path)
     path.write_text("time_us,pitch_rad\n1,2\n")
-    with pytest.raises(
-        GyroscopeError, match=r"g.csv: 'roll_rate_rad_s' is not in list; give a CSV file with the columns time_us, roll_rate"
-    ):
+    with pytest.raises(GyroscopeError, match=r"g.csv: no column roll_rate_rad_s, .*; give a CSV file with the columns time_us, roll_rate"):
         GyroscopeReadings.load(path)

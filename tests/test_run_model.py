@@ -649,7 +649,7 @@ def test_ways_to_follow_a_recording_are_compared(recording, truth, tmp_path):
     ("options", "message"),
     [
         (["--gyroscope", "g.csv"], "--gyroscope: found g.csv without --track; add --track, or leave it out"),
-        (["--track", "--motion", MOTION, "--gyroscope", "none.csv"], "none.csv: [Errno 2] No such file or directory: 'none.csv'; give "),
+        (["--track", "--motion", MOTION, "--gyroscope", "none.csv"], "none.csv: No such file or directory; give "),
         (["--track"], "--track: the model's scene has no [motion]; give --motion, the largest rates of theta, x, y, z"),
         (["--motion", MOTION], f"--motion: found {MOTION} without --track; add --track, or leave it out"),
         (["--track", "--motion", "1,2"], "--motion: found '1,2'; give four numbers from 0 on, as 0.1,0,0.3,1 (rad/s and m/s)"),
@@ -667,7 +667,7 @@ def test_tracking_that_cannot_be_done_is_refused(recording, tmp_path, options, m
 @pytest.mark.parametrize(
     ("text", "found"),
     [
-        ("time_us,roll_rad\n1,2\n", "'pitch_rad' is not in list"),
+        ("time_us,roll_rad\n1,2\n", "no column pitch_rad, yaw_rad, roll_plus_minus_rad"),
         (None, "No such file"),
         ("{header}\n1,0,0,0,0,-1,0\n", "found 1 lines, times that do not ascend, numbers that are not finite, or a plus-minus below 0"),
         ("{header}\n1,0,0,0,0,0,0\n1,0,0,0,0,0,0\n", "found 2 lines, times that do not ascend"),

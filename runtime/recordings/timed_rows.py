@@ -21,11 +21,14 @@ def timed_rows(path: str | Path, columns: Sequence[str]) -> NDArray[np.float64]:
     try:
         with Path(path).open(encoding="utf-8", newline="") as file:
             names = next(csv.reader(file), [])
+        if lacking := [name for name in columns if name not in names]:
+            raise ValueError(f"no column {', '.join(lacking)}")
         wanted = [names.index(name) for name in columns]
         with warnings.catch_warnings(action="ignore"):  # of a file without a line, which is refused below
             rows = np.loadtxt(path, delimiter=",", skiprows=1, usecols=wanted, ndmin=2)
     except (OSError, ValueError) as error:
-        raise ValueError(f"{path}: {one_line(error)}; give a CSV file with the columns {', '.join(columns)}") from error
+        reason = getattr(error, "strerror", None) or one_line(error)
+        raise ValueError(f"{path}: {reason}; give a CSV file with the columns {', '.join(columns)}") from error
     if len(rows) == 0 or not np.isfinite(rows).all() or (np.diff(rows[:, 0]) <= 0).any():
         found = f"{len(rows)} lines, times that do not ascend, or numbers that are not finite"
         raise ValueError(f"{path}: found {found}; give finite numbers in order of time")
