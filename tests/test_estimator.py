@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
@@ -237,8 +238,12 @@ def test_a_proposal_that_is_no_number_gives_way_to_the_centre(paper: Estimator, 
 def test_a_proposal_of_another_shape_is_refused(paper: Estimator, proposal: object) -> None:
     with pytest.raises(ValueError, match=r"^proposal: found shape .*, expected \(4,\): theta, x, y, z$"):
         paper.estimate(runway_image(PAPER, MIDDLE), proposal=proposal)  # type: ignore[arg-type]
+
+
+def test_a_prior_that_is_no_box_is_refused(paper: Estimator) -> None:
+    bounds: Any = [[0.5, 0, 0.8, 1.6], [0.6, 0, 0.9, 1.7]]
     with pytest.raises(ValueError, match=r"^prior: found list; give a runtime\.Box"):
-        paper.estimate(np.zeros((480, 640), dtype=bool), prior=[0, 1])  # pyright: ignore[reportArgumentType]
+        paper.estimate(runway_image(PAPER, MIDDLE), prior=bounds)
 
 
 def test_a_proposal_without_a_runway_is_not_believed(paper: Estimator) -> None:
