@@ -19,8 +19,9 @@ parameters, by a factor that they share. Parameters and pitches other than those
 
     |eta| <= (|nu| |w - w*| + small w) / (1 - |mu| - |nu| w - small w)
 
-and rho* is the state's own, as C, kappa and G are. So the rest is only what c, k and d leave in the middle, and what eta and the m_p may
-change, times how far each parameter may be off. c, k and d are read off four points; nothing rests on how well they fit but its size.
+and rho* is the state's own, as C, kappa and G are. So the rest is only what c, k and d leave in the middle of a stretch, and what eta, the
+m_p and, along the stretch, w and q may change, times how far each parameter may be off. c, k and d are read off four points; nothing rests
+on how well they fit but its size.
 
 A principal point that lies lower is all but a pitch. So the pitch of sets here is the one that is seen, c'' = c + p with Q_v = -p, and m_v
 is that of both together: a pitch that is p less adds q (cos(c) - sin(c) t).
@@ -67,7 +68,9 @@ class Moves:
     shown: tuple[Around, Around]
     """N."""
     reach: Floats
-    """How far from that of the points the ideal rows t of others of their stretches lie."""
+    """How far from that of the points the ideal rows t of others of their stretches lie, by the parameters in the middle."""
+    beside: Floats
+    """And how far from theirs the xi of those."""
     known: Bits
 
     @staticmethod
@@ -105,7 +108,9 @@ class Moves:
         known = known & ahead & optics.within(s, t, away)
         rows, offs = (by_a, by_b, by_zoom, by_u, by_v), optics.off(view.turns)
         reach_t = (np.abs(by_s.middle) + by_s.off) * reach + (np.abs(by_t.middle) + by_t.off) * down
-        return Moves(x, z, tangent, aside, y, rows, offs, inverse, shown, reach_t, known)
+        nearest = np.where(known, z.middle - z.off, 1.0)
+        beside_xi = reach / (nearest * nearest)  # dxi/dS' = 1/Z^2
+        return Moves(x, z, tangent, aside, y, rows, offs, inverse, shown, reach_t, beside_xi, known)
 
 
 def _rotation(view: View) -> tuple[Around, Around, Around, Around]:
@@ -178,6 +183,8 @@ class Derivatives:
     eta: Floats
     reach: Floats
     """How far w may be from that at the point along its stretch."""
+    beside: Floats
+    """And how far q."""
     known: Bits
 
     @staticmethod
@@ -189,6 +196,10 @@ class Derivatives:
         w = np.where(known, 1 / np.where(known, falls, 1.0), 1.0)
         eta, growth = np.zeros(1), np.ones(1)
         largest = cos_c.middle + cos_c.off
+        lower = w * largest * moves.reach  # by which share 1/w may be less elsewhere on the stretch
+        known = known & (lower < LARGEST_CHANGE)
+        reach = w * lower / np.where(known, 1 - lower, 1.0)
+        most = w + reach
         if common is not None:
             small: Floats = np.zeros(1)
             for off, row, taken in zip(moves.off, moves.rows, common.rows, strict=True):
@@ -196,12 +207,12 @@ class Derivatives:
             size = np.abs(moves.t.middle) + moves.t.off
             small = largest * small + np.where(cos_c.middle > STEEPEST_COSINE, 0.0, cos_c.off * size + sin_c.off)
             small = (small + ROUNDING_SHARE * (1 + size)) * ROUNDED_SWAY
-            least = 1 - common.mu - common.nu * w - small * w
+            least = 1 - common.mu - common.nu * most - small * most
             known = known & (least > LARGEST_CHANGE)
             growth = 1 / np.where(known, least, 1.0)
-            eta = (common.nu * np.abs(w - common.w) + small * w) * growth
+            eta = (common.nu * (np.abs(w - common.w) + reach) + small * most) * growth
         xi, _ = moves.x.over(moves.z)
-        q = xi * Around(w, w * (growth - 1))
+        q = xi * Around(w, most * growth - w)
         cos_a, sin_a, cos_b, sin_b = _rotation(view)
         leaning = sin_c * sin_b
         per, _ = Around(np.ones(1), np.zeros(1)).over(moves.z)
@@ -218,8 +229,8 @@ class Derivatives:
             cancelled = q * cos_c * (Around(np.ones(1), np.zeros(1)) - cos_a * per * moves.inverse[2])
             m_v = m_s * moves.inverse[1] + beside * moves.inverse[2] + cancelled - q * sin_c * moves.t
         m = m_a, m_b, m_zoom, m_u, m_v
-        reach = w * w * growth * largest * moves.reach
-        return Derivatives(tuple(w * each.middle for each in m), m, w, q.middle, eta, reach, known)
+        beside = most * moves.beside + np.abs(xi.middle) * reach
+        return Derivatives(tuple(w * each.middle for each in m), m, w, q.middle, eta, reach, beside, known)
 
 
 @dataclass(frozen=True)
@@ -307,8 +318,8 @@ class Unknowns:
         sheared, rest = at.w - self.common.w, np.zeros(1)
         for by, m, c, k, d, off in zip(at.by, at.m, self.c, self.k, self.d, self.off, strict=True):
             left = np.abs(by - c - k * sheared - d * at.q)
-            changed = at.w * (at.eta * (np.abs(m.middle) + m.off) + m.off)
-            beside = (np.abs(m.middle) + m.off + np.abs(k)) * at.reach
+            changed = (at.w + at.reach) * at.eta * (np.abs(m.middle) + m.off) + at.w * m.off
+            beside = (np.abs(m.middle) + m.off + np.abs(k)) * at.reach + np.abs(d) * at.beside
             terms = np.abs(by) + np.abs(c) + np.abs(k) * (np.abs(at.w) + np.abs(self.common.w)) + np.abs(d * at.q)
             rest = rest + off * (left + changed + beside + ROUNDING_SHARE * terms)
         rest = rest * self.focal * self._growth
