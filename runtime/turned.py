@@ -33,7 +33,6 @@ from runtime.scene import Camera, Scene
 from runtime.sensor import Sensor
 from runtime.sensor_map import LARGEST_ANGLE_RAD, SensorMap, Turn
 from runtime.state_set import StateSet
-from runtime.turn import arctangent, cosine_and_sine
 
 Floats = NDArray[np.float64]
 Bits = NDArray[np.bool_]
@@ -68,23 +67,14 @@ def bins_of(camera: Camera, attitude: Attitude, pitch: tuple[float, float]) -> I
     """Bins that cover the attitude at an interval of the pitch that the ideal frame shows."""
     reach = math.hypot(camera.width, camera.height) / 4  # of a point about whose distance from the centre is in the middle
     whole = Bin(np.array([pitch]), np.array([attitude.roll]), np.array([attitude.yaw]))
-    moved_a, moved_b = _moved_by_pitch(pitch, float(whole.yaw.mean()))
-    spans = moved_b * camera.focal_u_px + moved_a * reach, np.ptp(whole.yaw) * camera.focal_u_px, np.ptp(whole.roll) * reach
+    by_pitch = Turns.of(whole.pitch, np.zeros((1, 2)), whole.yaw.mean() * np.ones((1, 2)))
+    moved_px = 2 * (by_pitch.off_b[0] * camera.focal_u_px + by_pitch.off_a[0] * reach)
+    spans = moved_px, np.ptp(whole.yaw) * camera.focal_u_px, np.ptp(whole.roll) * reach
     counts = [max(math.ceil(span / BLUR_PX), 1) for span in spans]
     while math.prod(counts) > MOST_BINS:
         counts = [max(math.ceil(count / 2), 1) for count in counts]
     pitches, yaws, rolls = (_cut(side[0], count) for side, count in zip((whole.pitch, whole.yaw, whole.roll), counts, strict=True))
     return (Bin(one[None], roll[None], yaw[None]) for one in pitches for yaw in yaws for roll in rolls)
-
-
-def _moved_by_pitch(pitch: tuple[float, float], yaw: float) -> tuple[float, float]:
-    """By how much a and b differ within an interval of the pitch that the ideal frame shows, at one yaw, rad."""
-    low, high = pitch
-    cosine, sine = cosine_and_sine(np.array([low, min(max(low, 0.0), high), high, yaw]))  # b is largest at pitch 0
-    tangent = sine / cosine
-    tan_b = -cosine[:3] * tangent[3]
-    a, b = np.ptp(arctangent(np.stack([tan_b * tangent[:3] / np.sqrt(1 + tan_b * tan_b), tan_b])), axis=1)
-    return float(a), float(b)
 
 
 def _cut(interval: Floats, count: int) -> Floats:
