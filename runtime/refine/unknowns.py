@@ -223,8 +223,12 @@ class Derivatives:
         m_t = beside - q * cos_c * cos_a * per
         m_u, m_v = m_s * moves.inverse[0] + m_t * moves.inverse[1], m_s * moves.inverse[1] + m_t * moves.inverse[2]
         m_zoom = m_u * moves.shown[0] + m_v * moves.shown[1]
-        if optics.lens.model is None:
+        if optics.lens.model is None:  # m along the ray, from which N is as far as g and Q move it
             m_zoom = (sin_b + q * sin_c * cos_b) * per
+            zoom, *aside = optics.swings
+            for m, n, shift in zip((m_u, m_v), moves.shown, aside, strict=True):
+                beyond = (np.abs(m.middle) + m.off) * (zoom * (np.abs(n.middle) + n.off) + shift)
+                m_zoom = Around(m_zoom.middle, m_zoom.off + beyond)
         if optics.tilt > 0:
             cancelled = q * cos_c * (Around(np.ones(1), np.zeros(1)) - cos_a * per * moves.inverse[2])
             m_v = m_s * moves.inverse[1] + beside * moves.inverse[2] + cancelled - q * sin_c * moves.t
