@@ -177,6 +177,7 @@ class Calibration:
     roll_rad: float = 0.0
     yaw_rad: float = 0.0
     focal_relative: float = 0.0
+    """Of both focal lengths, by the same share: F_u/F_v is the camera model's."""
     principal_px: float = 0.0
 
     def __post_init__(self) -> None:
