@@ -144,7 +144,11 @@ BAD: list[tuple[str, Any, str]] = [
     ("z_m", {"edges": [1.6, math.nan]}, "domain.z_m.edges[1]: found nan; give a finite number"),
     ("z_m", {"edges": [1.6, 1e300]}, "domain.z_m.edges: found 1e+300; stay within 1000000"),
     ("z_m", {"edges": 1.6}, "domain.z_m.edges: found 1.6; give a list"),
-    ("z_m", {"edges": [1.6, 1.7], "width": 0.1}, "domain.z_m.edges: found an unknown key; known here: centres, width"),
+    (
+        "z_m",
+        {"edges": [1.6, 1.7], "width": 0.1},
+        "domain.z_m: found edges in a table of the other kind; give { centres, width }, { edges } or { from, to, ratio }",
+    ),
     ("z_m", {}, "domain.z_m: found {}; give { centres, width }, { edges } or { from, to, ratio }"),
     ("z_m", {"edge": [1.6, 1.7]}, "domain.z_m: found {'edge': [1.6, 1.7]}; give { centres, width }, { edges } or { from, to, ratio }"),
     ("z_m", GROWTH | {"ratio": 0.0}, "domain.z_m.ratio: found 0.0; give a cell's far border over its near one, above 1"),
