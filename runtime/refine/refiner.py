@@ -104,6 +104,8 @@ LEAST_SWAY_PX, WIDE_SWAY_PX = 0.25, 16.0
 """A plus-minus that moves no point of the frame by as much as the first is not cut; one that moves a point by the second is wide."""
 LARGEST_START = 2**12
 """More passing entries than this say that the frame tells next to nothing: they are left as they are, at a bounded cost."""
+FEW, LARGEST_START_ROWS = 2**9, 2**22
+"""So few are refined however many rows their markings show; more are left, too, if these show more rows than this between them."""
 LARGEST_SENSOR_START = 2**13
 """The same of a sensor's frame, whose entries are those of all bins of pitch, yaw and roll."""
 LARGEST_ROUND = 2**18
@@ -134,6 +136,8 @@ class Refiner:
         if len(entries) > (LARGEST_START if flat else LARGEST_SENSOR_START):
             return entries
         witnesses = LitPixels.of(frame, self.window, beyond=True)
+        if flat and len(entries) > FEW and len(entries) * len(self.scene.runway.markings) * witnesses.rows > LARGEST_START_ROWS:
+            return entries
         vouched = None if vouched_pixels is None else Vouched(LitPixels.of(vouched_pixels, self.window, beyond=False), self.extra_budget)
         level = NONE_MISSED if flat else TURNED if self.optics is None or self.optics.calibration.exact else UNKNOWN
         search = level if self.missed_budget == 0 else _search_with_missed(entries, narrowed)
