@@ -99,7 +99,7 @@ UNKNOWN = Search(first=512, sets=512, pieces=8, rounds=40, gain=0.005, finest=4,
 SWAYING = Search(first=512, sets=512, pieces=16, rounds=80, gain=0.002, finest=2, roll=2, yaw=2, patience=3)
 """Roll and yaw are known up to a plus-minus alone: half of it then tells more than half of a slice, and many pieces carry one face."""
 SWAYING_WIDELY = replace(SWAYING, pieces=32, rounds=160)
-"""They are known to degrees alone: the box goes on shrinking for more than a hundred rounds, to half the width of eighty."""
+"""They are known to degrees alone: the box goes on shrinking for over a hundred rounds, to six tenths of what eighty leave."""
 LEAST_SWAY_PX, WIDE_SWAY_PX = 0.25, 16.0
 """A plus-minus that moves no point of the frame by as much as the first is not cut; one that moves a point by the second is wide."""
 LARGEST_START = 2**12
@@ -133,11 +133,9 @@ class Refiner:
         cell then. `narrowed`: the entries were cut to what is known besides the frame.
         """
         flat = self.optics is None and entries.roll is None
-        if len(entries) > (LARGEST_START if flat else LARGEST_SENSOR_START):
+        if self.too_many(len(entries), frame) if flat else len(entries) > LARGEST_SENSOR_START:
             return entries
         witnesses = LitPixels.of(frame, self.window, beyond=True)
-        if flat and len(entries) > FEW and len(entries) * len(self.scene.runway.markings) * witnesses.rows > LARGEST_START_ROWS:
-            return entries
         vouched = None if vouched_pixels is None else Vouched(LitPixels.of(vouched_pixels, self.window, beyond=False), self.extra_budget)
         level = NONE_MISSED if flat else TURNED if self.optics is None or self.optics.calibration.exact else UNKNOWN
         search = level if self.missed_budget == 0 else _search_with_missed(entries, narrowed)
@@ -160,6 +158,11 @@ class Refiner:
             if idle == search.patience:
                 break
         return pieces
+
+    def too_many(self, entries: int, frame: Bits) -> bool:
+        """True if so many entries are left as they are, of a frame (height, width) of a level pinhole."""
+        rows = len(range(*self.window[0].indices(frame.shape[0])))
+        return entries > LARGEST_START or (entries > FEW and entries * len(self.scene.runway.markings) * rows > LARGEST_START_ROWS)
 
     def _with_turns(self, search: Search, entries: StateSet) -> Search:
         """The search of entries with roll and yaw, which cuts them where their plus-minus moves a point of the frame visibly.

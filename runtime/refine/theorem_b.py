@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from runtime.model.entries import Entries
-from runtime.refine.refiner import LARGEST_START, Refiner, joined
+from runtime.refine.refiner import Refiner, joined
 from runtime.state_set import StateSet
 
 LEAST_SEARCH = 2**7
-"""A cell's search costs at least as much as so many entries: with many cells, fewer entries are refined (`LARGEST_START`)."""
+"""A cell's search costs at least as much as so many entries: with many cells, fewer entries are refined (`Refiner.too_many`)."""
 
 
 def refined_by_cell(
@@ -32,7 +32,7 @@ def refined_by_cell(
     if known is not None:
         cells = {cell: known(sets) for cell, sets in cells.items()}
     cells = {cell: sets for cell, sets in cells.items() if len(sets)}
-    if sum(len(sets) + LEAST_SEARCH for sets in cells.values()) > LARGEST_START:
+    if refiner.too_many(sum(len(sets) + LEAST_SEARCH for sets in cells.values()), frame):
         return joined(*cells.values())
     left = (refiner.refine(frame, sets, entries.within(cell, frame), known is not None) for cell, sets in cells.items())
     return joined(entries.all[:0], *left)
