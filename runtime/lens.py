@@ -274,6 +274,8 @@ class Lens:
     def jacobian(self, x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
         """dD_x/dx, dD_x/dy = dD_y/dx and dD_y/dy, of any shape, up to what float64 loses."""
         square = x * x + y * y
+        if self.model is None:
+            return np.ones_like(square), np.zeros_like(square), np.ones_like(square)
         across = self._scale(square)
         gap = (self._slope(square) - across) / np.where(square > 0, square, 1.0)
         p2, p1 = self.tangential

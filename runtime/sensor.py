@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from runtime.attitude import Attitude
 from runtime.ideal import ideal_scene
 from runtime.image import dilated
 from runtime.outline import Outline
@@ -60,6 +61,14 @@ class Sensor:
     def optics(self) -> tuple[Optics, ...]:
         """What its lens does at the borders of its rows, for parts of its calibration's plus-minus; none for a pinhole known exactly."""
         return Optics.parts_of(self.scene)
+
+    def optics_at(self, attitude: Attitude) -> tuple[Optics, ...]:
+        """The same for a frame of this attitude: a pinhole's too, where the plus-minus moves what the frame shows by pixels."""
+        return self.optics or (self._of_pinhole if Optics.sways(self.scene.camera, attitude) else ())
+
+    @cached_property
+    def _of_pinhole(self) -> tuple[Optics, ...]:
+        return (Optics.of(self.scene.camera, self.scene.calibration),)
 
     def painted(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """The ideal frame of a sensor's frame, uint8 of {0, 1} both: as it is, or painted outward.

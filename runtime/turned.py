@@ -98,7 +98,7 @@ class TurnedStart:
     def left(self, refiner: Refiner, cut: Callable[[StateSet], StateSet] | None, refine: bool) -> StateSet:
         """What of the entries is consistent with the sensor's frame, and with what is known besides, to which `cut` cuts."""
         together = joined(*(sets if cut is None else cut(sets) for sets in self.parts))
-        return refined(refiner, self.sensor.optics, self.lit, together, cut is not None) if refine else together
+        return refined(refiner, self.sensor.optics_at(self.attitude), self.lit, together, cut is not None) if refine else together
 
     def regions(self, left: StateSet, domain: Box, parts: Sequence[NDArray[np.int64]] | None) -> tuple[Box, ...]:
         """Boxes around parts of what is left, by the camera's pitch; `domain` is of the pitch that the ideal frame shows."""

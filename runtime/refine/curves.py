@@ -24,7 +24,8 @@ from runtime.rounding import ROUNDING_SHARE
 
 PIECES = 8
 """A stretch is cut into so many, in each of which the lens's derivatives are bounded by those at its middle."""
-NEWTON_STEPS = 3
+NEWTON_STEPS = 2
+"""Of two, what is left is far below a millionth of a pixel; a straight line is found at once."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +117,7 @@ class Curves:
         first, last = (self.optics.lens.distorted(s + slope * (side - middle), side)[1] for side in (start, stop))
         share = (border - first) / np.where(last > first, last - first, 1.0)
         t = start + np.clip(share, 0.0, 1.0) * (stop - start)
-        for _ in range(NEWTON_STEPS):
+        for _ in range(NEWTON_STEPS if self.optics.lens.model else 0):
             at = s + slope * (t - middle)
             _, mixed, down = self.optics.lens.jacobian(at, t)
             rise = np.maximum(down + slope * mixed, self.rise[:, None])

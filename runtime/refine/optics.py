@@ -12,7 +12,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from runtime.attitude import Turns
+from runtime.attitude import Attitude, Turns
 from runtime.lens import LARGEST_RADIUS, Lens
 from runtime.refine.interval import Bits, Floats, Interval
 from runtime.rounding import ROUNDING_SHARE
@@ -23,6 +23,10 @@ from runtime.state_set import StateSet
 ZOOMED_PX = 0.2
 """A plus-minus of the focal lengths is cut into parts, up to `MOST_PARTS`, of which none moves a corner of the frame by much more."""
 MOST_PARTS = 4
+STILL_PX = 0.1
+"""What a rotation moves points by is taken out of offsets (`runtime.refine.unknowns`) from here on; below, bounds on it are as good."""
+SWAYING_PX = 1.5
+"""From here on that is worth its time for a pinhole too: with a pitch reference x is told several times as well, without, all is."""
 ROUNDED_DERIVATIVE = 2.0**-30
 """Covers what rounding does to a lens's derivatives."""
 
@@ -47,10 +51,10 @@ class Stretch:
 
 @dataclass(frozen=True)
 class Patch:
-    """Patches of the frame between two columns and two rows, in rays (S, T): left and right edges, each by its upper and lower end."""
+    """Patches of the frame between two columns and two rows, in rays (S, T): left and right edges, (2, ...), by upper and lower end."""
 
-    left: list[tuple[Floats, Floats]]
-    right: list[tuple[Floats, Floats]]
+    left: tuple[Floats, Floats]
+    right: tuple[Floats, Floats]
     off: Floats
     """How far a point of an edge may be from the segment between its ends."""
     middle: tuple[Floats, Floats]
@@ -106,6 +110,11 @@ class Optics:
         way = np.cumsum(np.pad(steps[:, :-1], ((0, 0), (1, 0))), axis=1)
         return Optics(camera, lens, (s.ravel(), t.ravel(), away.ravel()), off, way.ravel())
 
+    @staticmethod
+    def sways(camera: Camera, attitude: Attitude) -> bool:
+        """True if an attitude's plus-minus moves what a frame shows by `SWAYING_PX`."""
+        return bool(max(np.ptp(attitude.roll), np.ptp(attitude.yaw)) / 2 * camera.focal_u_px >= SWAYING_PX)
+
     @cached_property
     def swings(self) -> tuple[float, float, float]:
         """How far g, Q_u and Q_v may be from 0 (`runtime.refine.unknowns`)."""
@@ -134,8 +143,8 @@ class Optics:
         return shown / self.lens.stretches_around(radius, around) * (1 + ROUNDED_DERIVATIVE)
 
     def known(self, turns: Turns) -> bool:
-        """True where nothing is unknown of a camera."""
-        return not (max(self.swings) > 0 or (turns.off > 0).any())
+        """True where nothing is unknown of a camera, but of its rotation what moves no point of the frame's middle by `STILL_PX`."""
+        return self.calibration.exact and bool(turns.off.max(initial=0.0) * self.camera.focal_u_px < STILL_PX)
 
     def border(self, border: Floats) -> Floats:
         """How far from a border's own row, in focal lengths, other focal lengths may show it."""
@@ -188,19 +197,19 @@ class Optics:
         camera, known = self.camera, np.logical_and.reduce([np.isfinite(side) for side in (*columns, *rows)])
         u = [(np.where(known, side, camera.u0) - camera.u0) / camera.focal_u_px for side in columns]
         v = [(np.where(known, side, camera.v0) - camera.v0) / camera.focal_v_px for side in rows]
-        found = [[self.lens.undistorted(across, down) for down in v] for across in u]
-        off = np.maximum.reduce([corner[2] for side in found for corner in side])
+        across = np.stack([u[0], u[0], u[1], u[1], (u[0] + u[1]) / 2])
+        down = np.stack([v[0], v[1], v[0], v[1], (v[0] + v[1]) / 2])
+        s, t, away = self.lens.undistorted(across, down)
+        middle, off = (s[4], t[4]), away.max(axis=0)
         known &= np.isfinite(off)
-        s, t, away = self.lens.undistorted((u[0] + u[1]) / 2, (v[0] + v[1]) / 2)
         wide, tall = np.abs(u[1] - u[0]) / 2, np.abs(v[1] - v[0]) / 2
-        stretch = self.lens.stretches_around(np.sqrt(s * s + t * t), float(np.max(wide + tall, initial=0.0)) / self.lens.stretch)
-        known &= np.isfinite(away)
+        radius, around = np.sqrt(s[4] * s[4] + t[4] * t[4]), float(np.max(wide + tall, initial=0.0)) / self.lens.stretch
+        stretch = self.lens.stretches_around(radius, around)
         bow = self.lens.largest_bend / stretch**3 * tall**2 / 2
-        off = np.where(known, off + away + bow, 0.0) * (1 + ROUNDED_DERIVATIVE) + ROUNDING_SHARE
+        off = np.where(known, off + away[4] + bow, 0.0) * (1 + ROUNDED_DERIVATIVE) + ROUNDING_SHARE
         reach, beside = (wide + tall) / stretch, wide * (1 / stretch - 1 / self.lens.largest_scale) / 2
         reach, down = (side * (1 + ROUNDED_DERIVATIVE) + off for side in (reach, tall / stretch + beside))
-        left, right = ([(corner[0], corner[1]) for corner in side] for side in found)
-        return Patch(left, right, off, (s, t), reach, down, known)
+        return Patch((s[:2], t[:2]), (s[2:4], t[2:4]), off, middle, reach, down, known)
 
     def _place(self, column: Floats, row: Floats) -> NDArray[np.int64]:
         """Where a corner stands in the tables; -1 where it is no corner of the frame."""

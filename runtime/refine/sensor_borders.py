@@ -123,15 +123,17 @@ class SensorBorders:
         right = np.where(seen, last + (1 - camera.u0), 0.0) / camera.focal_u_px
         margin = self.margin_px / camera.focal_u_px
         rises = view.rises(tangent_v)
-        sway = view.sway((left + right) / 2, tangent_v[None], np.abs(right - left) / 2).beside(self.point, camera, view)
+        sway = self.beside_point(camera, (left + right) / 2, tangent_v[None], np.abs(right - left) / 2)
         low = view.quotient(left, tangent_v, -margin, np.minimum) * camera.focal_u_px - sway
         high = view.quotient(right, tangent_v, margin, np.maximum) * camera.focal_u_px + sway
         return _bounds_where(seen & rises, _no_column(first, last), low, high)
 
     def _offsets_behind_lens(self, optics: Optics, first: Floats, last: Floats, row: Floats) -> Interval:
-        """`offsets` by the rays of the corners of pixels, of a camera that is known exactly."""
+        """`offsets` by the rays of the corners of pixels, of a camera of which nothing is unknown but its attitude."""
         stretch = optics.between(first, last + 1, row)
+        sway = self.beside_point(optics.camera, *stretch.middle, stretch.reach)
         low, high = self._quotients(optics, stretch)
+        low, high = low - sway, high + sway
         return _bounds_where(stretch.known & self.view.rises_along(optics, stretch), _no_column(first, last), low, high)
 
     def sheared_offsets(self, first: Floats, last: Floats, rows: slice = slice(None)) -> tuple[Floats, Floats, Floats]:
@@ -152,6 +154,12 @@ class SensorBorders:
         margin = self.margin_px / focal + stretch.off
         low = self.view.quotient(*stretch.left, -margin, np.minimum, stretch.off) * focal
         return low, self.view.quotient(*stretch.right, margin, np.maximum, stretch.off) * focal
+
+    def beside_point(self, camera: Camera, tangent_u: Floats, tangent_v: Floats, reach: Floats) -> Floats:
+        """Largest |E(p) - E(p*)|, px, of points up to `reach` beside these; infinite where it is not known."""
+        if not self.view.turns.off.any():
+            return np.zeros(1)
+        return self.view.sway(tangent_u, tangent_v, reach).beside(self.point, camera, self.view)
 
     def seen_x(self, sets: StateSet) -> Interval:
         """Range of x'', to which offsets refer, (sets,), m."""

@@ -39,13 +39,16 @@ def sheared_at_ends(borders: SensorBorders, sight: Sight) -> tuple[Floats, Float
     patch = optics.patch((first, last), (start, stop))
     view, focal = borders.view, optics.camera.focal_u_px
     margin = borders.margin_px / focal + patch.off
-    low = np.minimum.reduce([view.quotient(*end, -margin, np.minimum, patch.off) for end in patch.left]) * focal
-    high = np.maximum.reduce([view.quotient(*end, margin, np.maximum, patch.off) for end in patch.right]) * focal
+    low = view.quotient(*patch.left, -margin, np.minimum, patch.off).min(axis=0) * focal
+    high = view.quotient(*patch.right, margin, np.maximum, patch.off).max(axis=0) * focal
     known &= patch.known & view.rises_along(optics, patch)
     w = np.zeros(low.shape)
     if borders.unknowns is not None:
         w, rest, certain = borders.unknowns.sheared_at(view, Moves.at(view, optics, *patch.middle, patch.reach, patch.down))
         low, high, known = low - rest, high + rest, known & certain
+    else:
+        sway = borders.beside_point(optics.camera, *patch.middle, patch.reach)
+        low, high = low - sway, high + sway
     known &= np.isfinite(low) & np.isfinite(high)
     low, high = np.where(known, low, -np.inf), np.where(known, high, np.inf)
     low, high = np.where(dark, np.inf, low), np.where(dark, -np.inf, high)
