@@ -98,10 +98,8 @@ UNKNOWN = Search(first=512, sets=512, pieces=8, rounds=40, gain=0.005, finest=4,
 """Where a camera may be off by its calibration, each piece is left with what that hides: more of them carry a face, and gains come late."""
 SWAYING = Search(first=512, sets=512, pieces=16, rounds=80, gain=0.002, finest=2, roll=2, yaw=2, patience=3)
 """Roll and yaw are known up to a plus-minus alone: half of it then tells more than half of a slice, and many pieces carry one face."""
-SWAYING_WIDELY = replace(SWAYING, pieces=32, rounds=160)
-"""They are known to degrees alone: the box goes on shrinking for over a hundred rounds, to six tenths of what eighty leave."""
-LEAST_SWAY_PX, WIDE_SWAY_PX = 0.25, 16.0
-"""A plus-minus that moves no point of the frame by as much as the first is not cut; one that moves a point by the second is wide."""
+LEAST_SWAY_PX = 0.25
+"""A plus-minus that moves no point of the frame by as much is not cut."""
 LARGEST_START = 2**12
 """More passing entries than this say that the frame tells next to nothing: they are left as they are, at a bounded cost."""
 FEW, LARGEST_START_ROWS = 2**9, 2**22
@@ -176,8 +174,7 @@ class Refiner:
         cuts = {name: getattr(SWAYING, name) for name, width_px in widths.items() if width_px >= LEAST_SWAY_PX}
         if not cuts:
             return search
-        finer = SWAYING if max(widths.values()) < WIDE_SWAY_PX else SWAYING_WIDELY
-        finer = replace(finer, z=search.z, scale=search.scale) if self.missed_budget > 0 else finer
+        finer = replace(SWAYING, z=search.z, scale=search.scale) if self.missed_budget > 0 else SWAYING
         return replace(finer, **{"roll": 1, "yaw": 1, **cuts})
 
     def _contracted(self, witnesses: LitPixels, vouched: Vouched | None, sets: StateSet) -> StateSet:
