@@ -25,7 +25,7 @@ ZOOMED_PX = 0.2
 MOST_PARTS = 4
 STILL_PX = 0.1
 """What a rotation moves points by is taken out of offsets (`runtime.refine.unknowns`) from here on; below, bounds on it are as good."""
-SWAYING_PX = 1.5
+SWAYING_PX = 0.5
 """From here on that is worth its time for a pinhole too: with a pitch reference x is told several times as well, without, all is."""
 ROUNDED_DERIVATIVE = 2.0**-30
 """Covers what rounding does to a lens's derivatives."""
