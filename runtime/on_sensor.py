@@ -45,6 +45,7 @@ def refined(refiner: Refiner, parts: tuple[Optics, ...], lit: Bits, entries: Sta
     refiner = replace(refiner, extra_budget=-1)
     if not parts:
         return replace(refiner, window=window_of(refiner.scene, few, None)).refine(lit, few, narrowed=narrowed)
+    refiner = replace(refiner, most_rows=refiner.most_rows // len(parts))
     return joined(*(_refined_by(refiner, optics, lit, few, narrowed) for optics in parts))
 
 

@@ -169,6 +169,22 @@ def test_more_entries_than_a_frame_can_tell_apart_are_left_as_they_are() -> None
     assert Refiner(PAPER, 0, -1).refine(np.zeros((480, 640), dtype=bool), many) is many
 
 
+def test_when_enough_rows_were_looked_at_no_more_rounds_are_begun(estimator_of: EstimatorOf, random_states: RandomStates) -> None:
+    """A bound on time: what is left then holds the state, and all that more rounds leave."""
+    model, shares = estimator_of("paper"), []
+    for state in random_states(PAPER, 6, 3):
+        frame = runway_image(PAPER, state)
+        entries = model.left_of(model.find(frame), refine=False)
+        whole, one_round = (
+            refiner.refine(frame.astype(bool), entries) for refiner in (Refiner(PAPER, 0, -1), Refiner(PAPER, 0, -1, most_rows=0))
+        )
+        assert holds(PAPER, one_round, state)
+        assert (one_round.lower.min(axis=0) <= whole.lower.min(axis=0)).all()
+        assert (one_round.upper.max(axis=0) >= whole.upper.max(axis=0)).all()
+        shares.append(np.ptp(one_round.theta) / np.ptp(whole.theta))
+    assert max(shares) > 1.01
+
+
 # --- connected parts ---
 
 

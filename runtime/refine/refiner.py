@@ -110,6 +110,8 @@ LARGEST_ROUND = 2**18
 """Rows of markings that a round looks at, about: where each set shows very many, fewer pieces are cut, and less finely at first."""
 LARGEST_BLOCK = 2**19
 """Sets are contracted so many at once that their markings have no more rows than this between them: memory is bounded."""
+LARGEST_SEARCH = 2**24
+"""Rows of markings that all rounds look at together, about: time is bounded, too, where many rounds go on gaining."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +125,8 @@ class Refiner:
     """Rows and columns outside of which pixels count as lit, whatever the frame shows there."""
     optics: Optics | None = None
     """Of the lens, where the frame is that of the sensor behind it; `scene` is the sensor's then."""
+    most_rows: int = LARGEST_SEARCH
+    """No more rounds are begun when so many rows were looked at."""
 
     def refine(self, frame: Bits, entries: StateSet, vouched_pixels: Bits | None = None, narrowed: bool = False) -> StateSet:
         """Slices that hold all states of `entries` which are consistent with `frame`, (height, width); none if there is none.
@@ -140,20 +144,23 @@ class Refiner:
         if not flat:
             entries = self._contracted(witnesses, vouched, entries)  # most contradict the frame as they are
             search = self._with_turns(search, entries) if entries.roll is not None else search
-        most_sets = max(LARGEST_ROUND // (len(self.scene.runway.markings) * witnesses.rows), 1)
+        set_rows = len(self.scene.runway.markings) * witnesses.rows
+        most_sets = max(LARGEST_ROUND // set_rows, 1)
         a_face = min(max(most_sets // (FACES * 2 * max(math.prod(search.others(number).values()) for number in (0, 1))), 1), search.pieces)
         slices = _parts(min(search.first, most_sets), len(entries), 1, search.finest)
         pieces = self._contracted(witnesses, vouched, _cut(entries, theta=slices, roll=search.roll, yaw=search.yaw))
-        extent, idle = _extent(pieces), 0
+        extent, idle, looked_at = _extent(pieces), 0, 0
         for number in range(search.rounds if len(pieces) else 0):
             outer = _carries_a_face(pieces, a_face)
             others = search.others(number)
             slices = _parts(min(search.sets, most_sets), int(outer.sum()) * math.prod(others.values()), 2, search.finest)
-            finer = self._contracted(witnesses, vouched, _cut(pieces[outer], theta=slices, **others))
+            cut = _cut(pieces[outer], theta=slices, **others)
+            looked_at += len(cut) * set_rows
+            finer = self._contracted(witnesses, vouched, cut)
             pieces, before = joined(finer, pieces[~outer]), extent
             extent = _extent(pieces)
             idle = idle + 1 if (extent > (1 - search.gain) * before).all() else 0
-            if idle == search.patience:
+            if idle == search.patience or looked_at > self.most_rows:
                 break
         return pieces
 
