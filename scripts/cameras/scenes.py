@@ -20,7 +20,7 @@ ASPECTS, OFF_CENTRE = (0.95, 1.05), 0.1
 LARGEST_RAD = math.radians(10)
 """Roll and yaw of the camera stay within this."""
 LINE_PX = {0: 0.85, 1: 0.15}
-MOUNTED, BOUNDED, OFF = 0.3, 0.15, 0.3
+MOUNTED, BOUNDED, OFF = 0.3, 0.05, 0.3
 """How often a camera is mounted otherwise than along the aircraft's axis, how often a scene states the attitude, and how often a camera may
 be off by its calibration."""
 STEEPEST_MOUNT_RAD = 1.55
