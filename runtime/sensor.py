@@ -63,7 +63,7 @@ class Sensor:
         return Optics.parts_of(self.scene)
 
     def optics_at(self, attitude: Attitude) -> tuple[Optics, ...]:
-        """The same for a frame of this attitude: a pinhole's too, where the plus-minus moves what the frame shows by pixels."""
+        """The same for a frame of this attitude: a pinhole's too, where the plus-minus is visible (`Optics.sways`)."""
         return self.optics or (self._of_pinhole if Optics.sways(self.scene.camera, attitude) else ())
 
     @cached_property

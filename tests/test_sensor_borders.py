@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scenes import examples
 from test_contractors import CONTRACTORS, WHOLE, Case, cases, clutter_of, spoiled, whole_markings
+from test_optics import BARREL, PINCUSHION
 from turned_state import TurnedState
 
 from runtime.refine.lit_pixels import LitPixels
@@ -24,7 +25,6 @@ from runtime.scene import Calibration, Distortion, SceneError
 
 Frame = NDArray[np.bool_]
 LARGEST_RAD = math.radians(10)
-BARREL, PINCUSHION = (Distortion("radial-tangential", k) for k in ((-0.28, 0.07, 0.0, 0.0), (0.2, 0.0, -0.001, 0.001)))
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ MOST_PARTS = 4
 STILL_PX = 0.1
 """What a rotation moves points by is taken out of offsets (`runtime.refine.unknowns`) from here on; below, bounds on it are as good."""
 SWAYING_PX = 0.5
-"""From here on that is worth its time for a pinhole too: with a pitch reference x is told several times as well, without, all is."""
+"""From here on that is worth its time for a pinhole too: its boxes are narrower, in x with a pitch reference, on all axes without one."""
 ROUNDED_DERIVATIVE = 2.0**-30
 """Covers what rounding does to a lens's derivatives."""
 

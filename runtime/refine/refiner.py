@@ -102,10 +102,10 @@ LEAST_SWAY_PX = 0.25
 """A plus-minus that moves no point of the frame by as much is not cut."""
 LARGEST_START = 2**12
 """More passing entries than this say that the frame tells next to nothing: they are left as they are, at a bounded cost."""
-FEW, LARGEST_START_ROWS = 2**9, 2**22
-"""So few are refined however many rows their markings show; more are left, too, if these show more rows than this between them."""
 LARGEST_SENSOR_START = 2**13
 """The same of a sensor's frame, whose entries are those of all bins of pitch, yaw and roll."""
+FEW, LARGEST_START_ROWS = 2**9, 2**22
+"""Of a level pinhole, so few are refined however many rows their markings show; more are left, too, if these show more rows than this."""
 LARGEST_ROUND = 2**18
 """Rows of markings that a round looks at, about: where each set shows very many, fewer pieces are cut, and less finely at first."""
 LARGEST_BLOCK = 2**19
