@@ -212,16 +212,20 @@ class Lens:
         if self.model != "fisheye":
             return _horner(self.radial, square)
         r = np.sqrt(square)
-        angle = arctangent(r)
+        return self._fisheye_scale(r, arctangent(r))
+
+    def _fisheye_scale(self, r: Floats, angle: Floats) -> Floats:
+        """The same by r and its angle."""
         return _horner(self.radial, angle * angle) * np.where(r > 0, angle / np.where(r > 0, r, 1.0), 1.0)
 
-    def _slope(self, square: Floats) -> Floats:
-        """f' of r^2."""
+    def _scale_and_slope(self, square: Floats) -> tuple[Floats, Floats]:
+        """f/r and f' of r^2."""
         terms = [k * (2 * place + 3) for place, k in enumerate(self.radial)]
         if self.model != "fisheye":
-            return _horner(terms, square)
-        angle = arctangent(np.sqrt(square))
-        return _horner(terms, angle * angle) / (1 + square)
+            return _horner(self.radial, square), _horner(terms, square)
+        r = np.sqrt(square)
+        angle = arctangent(r)
+        return self._fisheye_scale(r, angle), _horner(terms, angle * angle) / (1 + square)
 
     def undistorted(self, x: Floats, y: Floats, off: Floats | float = 0.0) -> tuple[Floats, Floats, Floats]:
         """The rays of the disc that the lens shows within `off` of (x, y): a centre, and how far from it they are at most.
@@ -261,8 +265,7 @@ class Lens:
         share = np.interp(size, shown, edges) / np.where(size > 0, size, 1.0)
         found_x, found_y = x * share, y * share
         for _ in range(NEWTON_STEPS):
-            off_x, off_y = self.distorted(found_x, found_y)
-            a, b, d = self.jacobian(found_x, found_y)
+            (off_x, off_y), (a, b, d) = self.distorted_and_jacobian(found_x, found_y)
             off_x, off_y = off_x - x, off_y - y
             determinant = a * d - b * b
             found_x, found_y = found_x - (d * off_x - b * off_y) / determinant, found_y - (a * off_y - b * off_x) / determinant
@@ -273,16 +276,23 @@ class Lens:
 
     def jacobian(self, x: Floats, y: Floats) -> tuple[Floats, Floats, Floats]:
         """dD_x/dx, dD_x/dy = dD_y/dx and dD_y/dy, of any shape, up to what float64 loses."""
+        return self.distorted_and_jacobian(x, y)[1]
+
+    def distorted_and_jacobian(self, x: Floats, y: Floats) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats, Floats]]:
+        """D(x, y), and its `jacobian`: at less than the cost of both."""
         square = x * x + y * y
         if self.model is None:
-            return np.ones_like(square), np.zeros_like(square), np.ones_like(square)
-        across = self._scale(square)
-        gap = (self._slope(square) - across) / np.where(square > 0, square, 1.0)
+            return (x, y), (np.ones_like(square), np.zeros_like(square), np.ones_like(square))
+        scale, slope = self._scale_and_slope(square)
+        gap = (slope - scale) / np.where(square > 0, square, 1.0)
+        mixed = gap * x * y
+        if not any(self.tangential):
+            return (x * scale, y * scale), (scale + gap * x * x, mixed, scale + gap * y * y)
         p2, p1 = self.tangential
         along = 2 * (p2 * x + p1 * y)
-        a = across + gap * x * x + along + 4 * p2 * x
-        d = across + gap * y * y + along + 4 * p1 * y
-        return a, gap * x * y + 2 * (p1 * x + p2 * y), d
+        shown = x * scale + x * along + p2 * square, y * scale + y * along + p1 * square
+        a, d = scale + gap * x * x + along + 4 * p2 * x, scale + gap * y * y + along + 4 * p1 * y
+        return shown, (a, mixed + 2 * (p1 * x + p2 * y), d)
 
     def shown_range(self, x: Interval, y: Interval) -> tuple[Interval, Interval]:
         """Outward enclosure of D over boxes of rays in the disc: D at the middle, and the Jacobian's range times the half-widths."""

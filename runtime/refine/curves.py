@@ -74,29 +74,25 @@ class Curves:
 
     def met(self, border: Floats) -> Met:
         """Where they may meet borders that the lens shows at these D_y, (rows, sets)."""
-        t = self._found(border)
+        t, turns = self._found(border), self.lines.view.turns
         (low, high), known = self.lines.at(t)
         s, half = (low + high) / 2, ((high - low) / 2 + self.margin) * (1 + ROUNDING_SHARE)
-        _, mixed, _, off = self.optics.derivatives(s, t, half)
-        shown = self.optics.lens.distorted(s, t)[1]
-        turns = self.lines.view.turns
+        (shown, shown_row), (across, mixed, _) = self.optics.lens.distorted_and_jacobian(s, t)
         off_row = self.optics.border(border) + self.optics.beside_tilt(turns, s, t, half)[1]
-        miss = np.abs(shown - border) + (np.abs(mixed) + off) * half + off_row + self._rounding(border)
+        miss = np.abs(shown_row - border) + (np.abs(mixed) + self.optics.bent(half)) * half + off_row + self._rounding(border)
         reach = miss / self.rise[:, None] * (1 + ROUNDED_DERIVATIVE)
-        (first_low, first_high), first_known = self.lines.at(t - reach)
-        (last_low, last_high), last_known = self.lines.at(t + reach)
-        low, high = np.minimum(first_low, last_low), np.maximum(first_high, last_high)
-        s, half = (low + high) / 2, ((high - low) / 2 + self.margin) * (1 + ROUNDING_SHARE)
+        steepest = np.maximum(*np.abs(self.lines.slopes))
+        half = (half + steepest * reach) * (1 + ROUNDING_SHARE)
         around = half + reach
-        across, mixed, _, off = self.optics.derivatives(s, t, around)
-        known = known & first_known & last_known & self.monotone[:, None] & self.optics.within(s, t, around)
-        beside = (across + off) * half + (np.abs(mixed) + off) * reach
-        shown = self.optics.lens.distorted(s, t)[0]
+        off = self.optics.bent(around)
+        known = known & self.monotone[:, None] & self.optics.within(s, t, around)
+        beside = (np.abs(across) + off) * half + (np.abs(mixed) + off) * reach
         beside += self.optics.beside_tilt(turns, s, t, around)[0] + self.optics.lens.rounding + ROUNDING_SHARE * np.abs(shown)
         # Between two borders a curve leaves what lies between where it meets them by less than it bends over two rows' way.
-        way = 2 * (1 + np.maximum(*np.abs(self.lines.slopes))) / (self.optics.camera.focal_v_px * self.rise[:, None])
+        way = 2 * (1 + steepest) / (self.optics.camera.focal_v_px * self.rise[:, None])
         beside += self.optics.lens.largest_bend * way * way / 8
-        return Met((low, high), (t - reach, t + reach), (shown - beside, shown + beside), known, known & self._spanned(border))
+        sides = (s - half, s + half), (t - reach, t + reach), (shown - beside, shown + beside)
+        return Met(*sides, known, known & self._spanned(border))
 
     def _spanned(self, border: Floats) -> Bits:
         """True where both ends of the stretches of all lines lie on either side of a border, (markings, rows, sets)."""
@@ -119,9 +115,9 @@ class Curves:
         t = start + np.clip(share, 0.0, 1.0) * (stop - start)
         for _ in range(NEWTON_STEPS if self.optics.lens.model else 0):
             at = s + slope * (t - middle)
-            _, mixed, down = self.optics.lens.jacobian(at, t)
+            (_, shown), (_, mixed, down) = self.optics.lens.distorted_and_jacobian(at, t)
             rise = np.maximum(down + slope * mixed, self.rise[:, None])
-            t = np.clip(t - (self.optics.lens.distorted(at, t)[1] - border) / rise, start, stop)
+            t = np.clip(t - (shown - border) / rise, start, stop)
         return t
 
     def _rounding(self, border: Floats) -> Floats:
@@ -136,8 +132,8 @@ def shown_rows(optics: Optics, turns: Turns, s: Interval, t: Interval) -> tuple[
     middle_s, middle_t = (s[0] + s[1]) / 2, (t[0] + t[1]) / 2
     half_s, half_t = ((side[1] - side[0]) / 2 * (1 + ROUNDING_SHARE) + ROUNDING_SHARE * np.abs(side[1]) for side in (s, t))
     reach = half_s + half_t
-    _, mixed, down, off = optics.derivatives(middle_s, middle_t, reach)
+    (_, shown), (_, mixed, down) = optics.lens.distorted_and_jacobian(middle_s, middle_t)
+    off = optics.bent(reach)
     beside = (np.abs(mixed) + off) * half_s + (down + off) * half_t + optics.lens.rounding
     beside = beside + optics.beside_tilt(turns, middle_s, middle_t, reach)[1]
-    shown = optics.lens.distorted(middle_s, middle_t)[1]
     return (shown - beside, shown + beside), known & optics.within(middle_s, middle_t, reach)

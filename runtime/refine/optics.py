@@ -24,7 +24,8 @@ ZOOMED_PX = 0.2
 """A plus-minus of the focal lengths is cut into parts, up to `MOST_PARTS`, of which none moves a corner of the frame by much more."""
 MOST_PARTS = 4
 STILL_PX = 0.1
-"""What a rotation moves points by is taken out of offsets (`runtime.refine.unknowns`) from here on; below, bounds on it are as good."""
+"""What the plus-minus of roll and yaw moves points by is taken out of offsets (`runtime.refine.unknowns`) from here on; below, and for what a
+known rotation does at a set's pitches, bounds on it are as good."""
 SWAYING_PX = 0.5
 """From here on that is worth its time for a pinhole too: its boxes are narrower, in x with a pitch reference, on all axes without one."""
 ROUNDED_DERIVATIVE = 2.0**-30
@@ -113,7 +114,7 @@ class Optics:
     @staticmethod
     def sways(camera: Camera, attitude: Attitude) -> bool:
         """True if an attitude's plus-minus moves what a frame shows by `SWAYING_PX`."""
-        return bool(max(np.ptp(attitude.roll), np.ptp(attitude.yaw)) / 2 * camera.focal_u_px >= SWAYING_PX)
+        return _moved_px(camera, np.array([attitude.roll, attitude.yaw])) >= SWAYING_PX
 
     @cached_property
     def swings(self) -> tuple[float, float, float]:
@@ -142,9 +143,10 @@ class Optics:
         around = float(np.max(reach + shown / self.lens.stretch, initial=0.0))
         return shown / self.lens.stretches_around(radius, around) * (1 + ROUNDED_DERIVATIVE)
 
-    def known(self, turns: Turns) -> bool:
-        """True where nothing is unknown of a camera, but of its rotation what moves no point of the frame's middle by `STILL_PX`."""
-        return self.calibration.exact and bool(turns.off.max(initial=0.0) * self.camera.focal_u_px < STILL_PX)
+    def known(self, sets: StateSet) -> bool:
+        """True where nothing is unknown of the sets' camera, but of its roll and yaw what moves nothing by `STILL_PX`."""
+        sides = [angle for angle in (sets.roll, sets.yaw) if angle is not None]
+        return self.calibration.exact and all(_moved_px(self.camera, side) < STILL_PX for side in sides)
 
     def border(self, border: Floats) -> Floats:
         """How far from a border's own row, in focal lengths, other focal lengths may show it."""
@@ -219,9 +221,17 @@ class Optics:
 
     def derivatives(self, s: Floats, t: Floats, reach: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """dD_x/dS, dD_x/dT = dD_y/dS and dD_y/dT at rays, and how far each may be from that within `reach` of them, within the disc."""
-        across, mixed, down = self.lens.jacobian(s, t)
-        return across, mixed, down, self.lens.largest_bend * reach * (1 + ROUNDED_DERIVATIVE) + ROUNDED_DERIVATIVE
+        return *self.lens.jacobian(s, t), self.bent(reach)
+
+    def bent(self, reach: Floats) -> Floats:
+        """How far derivatives at rays of the disc that are so far apart may differ, and what float64 loses of them."""
+        return self.lens.largest_bend * reach * (1 + ROUNDED_DERIVATIVE) + ROUNDED_DERIVATIVE
 
     def within(self, s: Floats, t: Floats, reach: Floats) -> Bits:
         """True where all rays within `reach` of these lie in the lens's disc."""
         return np.sqrt(s * s + t * t) + reach <= self.lens.radius * (1 - ROUNDED_DERIVATIVE)
+
+
+def _moved_px(camera: Camera, angles: Floats) -> float:
+    """How far the widest of some intervals, (angles, 2), rad, moves points of the frame's middle to either side."""
+    return float(np.ptp(angles, axis=1).max(initial=0.0)) / 2 * camera.focal_u_px

@@ -159,7 +159,7 @@ class Refiner:
             finer = self._contracted(witnesses, vouched, cut)
             pieces, before = joined(finer, pieces[~outer]), extent
             extent = _extent(pieces)
-            idle = idle + 1 if (extent > (1 - search.gain) * before).all() else 0
+            idle = idle + 1 if (extent >= (1 - search.gain) * before).all() else 0
             if idle == search.patience or looked_at > self.most_rows:
                 break
         return pieces

@@ -90,7 +90,7 @@ class SensorBorders:
             near, far = (_rays_of_ends(scene.camera, sets, view, offset, rows, margin_px).rows for rows in (ideal_near, ideal_far))
         else:
             near, far, curves, points = _ends_behind_lens(scene, sets, view, offset, (ideal_near, ideal_far), margin_px, lines)
-            unknowns = None if optics.known(view.turns) else Unknowns.of(view, optics, points)
+            unknowns = None if optics.known(sets) else Unknowns.of(view, optics, points)
         first, last = (
             np.minimum(np.maximum(np.floor(row), pixels.top), pixels.bottom)
             for row in (np.minimum.reduce([*far[0], *near[0]], axis=0), np.maximum.reduce([*near[1], *far[1]], axis=0))
