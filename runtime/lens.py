@@ -35,7 +35,7 @@ LARGEST_RADIUS = 6.0
 """Tangent of the largest angle off the axis that is looked at, 80 degrees; what a lens shows beyond counts as not seen."""
 LEAST_STRETCH = 2.0**-7
 """A lens whose derivative is not proved to exceed this counts as folded: a pixel of it would span a hundred of the ideal frame."""
-NEWTON_STEPS = 4
+NEWTON_STEPS = 3
 TINY = 2.0**-60
 """Of squares of a radius no larger than this no quotient is taken."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +33,12 @@ class Sensor:
     painting: Painting | None
 
     @staticmethod
+    @lru_cache(maxsize=1)
     def of(scene: Scene) -> Sensor:
-        """Raises `SceneError` for a lens that folds within the frame, and for a sensor that shows nothing of the runway."""
+        """Raises `SceneError` for a lens that folds within the frame, and for a sensor that shows nothing of the runway.
+
+        The last one is kept: a model that is loaded again with another budget has the same.
+        """
         if scene.camera.pinhole:
             return Sensor(scene, scene, 1, None, None)
         sensor = SensorMap.of(scene)

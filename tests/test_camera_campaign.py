@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 pytest.importorskip("faery", reason="the extra 'recordings' is not installed")
 
 from cameras import campaign
-from cameras.attitudes import KNOWN, MOST_RUNS, runs
+from cameras.attitudes import EXACTLY_KNOWN, KNOWN, MOST_RUNS, runs
 from cameras.bases import RANDOM, named_scenes
 from cameras.frames import CLUTTER, STATES
 from cameras.scenes import ASPECTS, K1, OFF_CENTRE, DrawnCamera, draw_camera
@@ -112,6 +112,20 @@ def test_frames_are_of_every_kind_and_what_is_told_of_them_holds(small: BuiltSce
     wanted = {"as the scene states"} if stated else {*KNOWN, "by the aircraft's reading"}
     assert {*wanted, *CLUTTER, *STATES, "pitch told", "m = 0", "all"} <= set(kinds)
     assert stated or max(off) > 0.9
+    forget_scenes()
+
+
+def test_all_may_be_told_exactly(tmp_path: Path) -> None:
+    """Every kind of lens, no calibration, no plus-minus."""
+    drawn = [draw_camera(np.random.default_rng([5, number]), PINHOLE, exactly=True) for number in range(60)]
+    kinds = {kind for each in drawn for kind in each.kinds}
+    assert {"no lens", "a fisheye lens", "k1 -0.4 to -0.2", "mounted"} <= kinds
+    assert not {"camera off", "[attitude] stated"} & kinds
+    built = build_scene(DrawnScene(SMALL["lens"], ("lens",)), tmp_path / "lens.onnx", "1/2.3")
+    trial = CameraTrial(3, 4, 0, PATIENCE_S, exactly=True)
+    told = Counter(trial.frame_trial(built, number).turned.told.kinds[0] for number in range(40))
+    assert set(told) == set(EXACTLY_KNOWN)
+    assert trial.key != replace(trial, exactly=False).key
     forget_scenes()
 
 

@@ -24,8 +24,8 @@ ZOOMED_PX = 0.2
 """A plus-minus of the focal lengths is cut into parts, up to `MOST_PARTS`, of which none moves a corner of the frame by much more."""
 MOST_PARTS = 4
 STILL_PX = 0.1
-"""What the plus-minus of roll and yaw moves points by is taken out of offsets (`runtime.refine.unknowns`) from here on; below, and for what a
-known rotation does at a set's pitches, bounds on it are as good."""
+"""What the plus-minus of roll and yaw moves points by is taken out of offsets (`runtime.refine.unknowns`) from here on; below, and for what
+a known rotation does at a set's pitches, bounds on it are as good."""
 SWAYING_PX = 0.5
 """From here on that is worth its time for a pinhole too: its boxes are narrower, in x with a pitch reference, on all axes without one."""
 ROUNDED_DERIVATIVE = 2.0**-30

@@ -92,7 +92,7 @@ one, after which the pieces that carry the faces are small enough for the next o
 SOME_MISSED_X_KNOWN = replace(SOME_MISSED, first=24, sets=216, gain=0.06, together=True)
 NARROWED_X_KNOWN = replace(NARROWED, first=4, pieces=4, together=True)
 """Where x is known theta needs fewer slices, and cutting scale and z at once tells more of z; where it is not, theta is worth the sets."""
-TURNED = Search(first=128, sets=128, pieces=6, rounds=40, gain=0.02, finest=8, z=2, scale=2, patience=2)
+TURNED = Search(first=128, sets=128, pieces=6, rounds=40, gain=0.04, finest=8, z=2, scale=2, patience=2)
 """Pairs of borders tell nothing on a turned sensor: theta is cut, round by round, and the scale: some frames stay far wider without."""
 UNKNOWN = Search(first=512, sets=512, pieces=8, rounds=40, gain=0.01, finest=4, z=2, scale=2, patience=2, together=True)
 """Where a camera may be off by its calibration, each piece is left with what that hides: more of them carry a face, and are cut smaller."""

@@ -92,15 +92,16 @@ class View:
         """
         across_, down, ahead, _ = self.rays(tangent_u, tangent_v)
         across_ = across_ + margin
-        bounds = []
+        terms = ROUNDING_SHARE * (np.abs(down) + np.abs(ahead)) + (0.0 if off is None else off)
+        beside = np.where((across_ < 0) == (extreme is np.minimum), -terms, terms)
+        bounds, known = [], np.ones(1, dtype=bool)
         for cosine, sine, fall in zip(self.cosine, self.sine, self.fall, strict=True):
             falls = cosine * down + sine * ahead
-            terms = ROUNDING_SHARE * (np.abs(down) + np.abs(ahead)) + (0.0 if off is None else off)
-            for side in (falls - terms, falls + terms):
-                bounds.append(np.where(falls > terms, across_ / np.where(falls > terms, side, 1.0), -np.inf) * fall)
-        worst = np.minimum.reduce(bounds) if extreme is np.minimum else np.maximum.reduce(bounds)
-        known = np.logical_and.reduce([np.isfinite(bound) for bound in bounds])
-        rounded = ROUNDING_SHARE * self.condition * np.abs(np.where(known, worst, 0.0))
+            fine = falls > terms
+            known = known & fine
+            bounds.append(across_ / np.where(fine, falls + beside, 1.0) * fall)
+        worst = extreme(*bounds)
+        rounded = ROUNDING_SHARE * self.condition * np.abs(worst)
         nothing = -np.inf if extreme is np.minimum else np.inf
         return np.where(known, worst - rounded if extreme is np.minimum else worst + rounded, nothing)
 

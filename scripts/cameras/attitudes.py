@@ -22,6 +22,9 @@ from runtime.turned import bins_of, seen_box
 
 KNOWN = {"level": 0.15, "attitude known exactly": 0.65, "attitude to 0.1 degrees": 0.12, "attitude to 0.6 degrees": 0.08}
 """How well the attitude is known, and how often: a plus-minus takes ten times as long as none."""
+EXACTLY_KNOWN = {"level": 0.2, "attitude known exactly": 0.8}
+"""The same of a campaign in which all is told exactly."""
+Shares = dict[str, float]
 PLUS_MINUS_RAD = {"attitude to 0.1 degrees": (1e-5, 0.0017), "attitude to 0.6 degrees": (0.0017, 0.01)}
 """Of roll and of yaw; one of them is known exactly in a third of the frames."""
 PITCH_TOLD, PITCH_PLUS_MINUS_RAD = 0.4, (1e-4, 0.01)
@@ -85,9 +88,9 @@ class Readings:
     kinds: Kinds
 
     @staticmethod
-    def draw(rng: Rng, stated: bool, calibration: Calibration) -> Readings:
-        """Of a frame whose camera's roll and yaw no scene states, or one does, of a camera that may be off."""
-        chosen = {name: share for name, share in KNOWN.items() if name != "level"}
+    def draw(rng: Rng, stated: bool, calibration: Calibration, shares: Shares) -> Readings:
+        """Of a frame whose camera's roll and yaw no scene states, or one does, of a camera that may be off, known in one of these ways."""
+        chosen = {name: share for name, share in shares.items() if name != "level"}
         known = str(rng.choice(list(chosen), p=np.array(list(chosen.values())) / sum(chosen.values())))
         low, high = np.log10(PLUS_MINUS_RAD.get(known, (1.0, 1.0)))
         halves = 10.0 ** rng.uniform(low, high, 3) * (known in PLUS_MINUS_RAD)
@@ -131,9 +134,9 @@ class Readings:
         return tuple(_around(angle - arb(more), half, share) for angle, half, share, more in sides)
 
 
-def draw_told(rng: Rng, estimator: Estimator, state: TurnedState, level: bool) -> Told:
+def draw_told(rng: Rng, estimator: Estimator, state: TurnedState, level: bool, shares: Shares) -> Told:
     """What is told of a state's camera, enough for `MOST_RUNS`; nothing of its attitude where it is level."""
-    readings = Readings.draw(rng, estimator.scene.attitude is not None, estimator.scene.calibration)
+    readings = Readings.draw(rng, estimator.scene.attitude is not None, estimator.scene.calibration, shares)
     if level:
         prior = replace(readings, kinds=("level",)).told(estimator, state)
         return replace(prior, attitude=None)

@@ -20,7 +20,7 @@ from random_scenes.sights import Rng
 from rational_image import RationalState, RationalView
 from turned_state import TurnedState
 
-from cameras.attitudes import KNOWN, Told, draw_told, draw_turn, turned_by
+from cameras.attitudes import KNOWN, Shares, Told, draw_told, draw_turn, turned_by
 from runtime import Attitude, Estimator
 
 CLUTTER = {"no clutter": 0.3, "clutter 0-2%": 0.25, "clutter 2-20%": 0.2, "second runway": 0.15, "other": 0.1}
@@ -63,10 +63,10 @@ class TurnedFrame(DrawnFrame):
     refine: tuple[bool, ...]
 
 
-def draw_frame(rng: Rng, stage: Stage, estimator_of: Callable[[int], Estimator]) -> TurnedFrame:
-    """A frame; `estimator_of` loads the model with a budget m."""
+def draw_frame(rng: Rng, stage: Stage, estimator_of: Callable[[int], Estimator], shares: Shares = KNOWN) -> TurnedFrame:
+    """A frame; `estimator_of` loads the model with a budget m, `shares` says how often the attitude is known how well."""
     estimator, off = estimator_of(0), stage.scene.calibration
-    level = estimator.attitude is None and bool(rng.random() < KNOWN["level"] + OFF_AND_LEVEL * (not off.exact))
+    level = estimator.attitude is None and bool(rng.random() < shares["level"] + OFF_AND_LEVEL * (not off.exact))
     most = min(estimator.largest_missed_budget, MOST_MISSED)
     missed = int(rng.integers(1, most + 1)) if most > 0 and rng.random() < 0.35 else 0
     extra = int(rng.choice(EXTRA)) if stage.view.lens is None and rng.random() < VOUCHED[level] else -1
@@ -77,7 +77,7 @@ def draw_frame(rng: Rng, stage: Stage, estimator_of: Callable[[int], Estimator])
     view = camera if level else turned.turned(camera)
     if kind in MOVED:
         turned = MOVED[kind](rng, stage, turned, view)
-    told = draw_told(rng, estimator, turned, level)
+    told = draw_told(rng, estimator, turned, level, shares)
     sights = [Sight(turned, view, stage.counted(view) if level else view)]
     picture, clutter = drawn(rng, stage, estimator, sights, told, level)
     if level and extra >= 0:

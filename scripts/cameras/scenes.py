@@ -51,8 +51,11 @@ def draw_lens(rng: Rng) -> tuple[Distortion | None, str]:
     return Distortion(model, (k1, k2, *tangential, *third)), kind
 
 
-def draw_camera(rng: Rng, scene: Scene) -> DrawnCamera:
-    """The scene seen by another camera of the same size and about the same focal length. Raises `SceneError` where it is refused."""
+def draw_camera(rng: Rng, scene: Scene, exactly: bool = False) -> DrawnCamera:
+    """The scene seen by another camera of the same size and about the same focal length. Raises `SceneError` where it is refused.
+
+    `exactly`: it is off by nothing, and the scene states no attitude.
+    """
     camera, (lens, kind) = scene.camera, draw_lens(rng)
     aspect, right, down = float(rng.uniform(*ASPECTS)), *(float(side) for side in rng.uniform(-OFF_CENTRE, OFF_CENTRE, 2))
     mount = draw_mount(rng, scene) if rng.random() < MOUNTED else None
@@ -65,10 +68,10 @@ def draw_camera(rng: Rng, scene: Scene) -> DrawnCamera:
         mount=mount,
     )
     line_px = int(rng.choice(list(LINE_PX), p=list(LINE_PX.values())))
-    off = draw_calibration(rng) if rng.random() < OFF else Calibration()
+    off = draw_calibration(rng) if not exactly and rng.random() < OFF else Calibration()
     if lens is None:
         line_px += whole_pixels(drawn, off)
-    bounds = draw_bounds(rng) if rng.random() < BOUNDED else None
+    bounds = draw_bounds(rng) if not exactly and rng.random() < BOUNDED else None
     kinds = {
         kind: True,
         "tangential": lens is not None and lens.model != "fisheye" and any(lens.coefficients[2:4]),

@@ -19,6 +19,7 @@ from random_scenes.scenes import DrawnScene
 from random_scenes.trial import LONG_PATIENCE, Trial
 from random_scenes.watch import watched
 
+from cameras.attitudes import EXACTLY_KNOWN, KNOWN
 from cameras.bases import draw_base, named_scenes
 from cameras.frames import TurnedFrame, draw_frame
 from cameras.scenes import draw_camera
@@ -97,14 +98,18 @@ def reason_of(detail: str) -> str:
 
 @dataclass(frozen=True)
 class CameraTrial(Trial):
-    """Camera number `scene` of a campaign, and how many frames of it are judged. `files`: the scenes, by default `named_scenes`'s."""
+    """Camera number `scene` of a campaign, and how many frames of it are judged. `files`: the scenes, by default `named_scenes`'s.
+
+    `exactly`: the camera and its attitude are told exactly.
+    """
 
     files: tuple[str, ...] = ()
+    exactly: bool = False
 
     @property
     def key(self) -> tuple[str | int, ...]:
         """What the outcomes are found again by."""
-        return (*super().key, *(os.path.abspath(path) for path in self.files))
+        return (*super().key, self.exactly, *(os.path.abspath(path) for path in self.files))
 
     def built(self, draw: int, path: Path) -> BuiltScene:
         """A draw's model. Raises `SceneError` where it is refused."""
@@ -113,11 +118,12 @@ class CameraTrial(Trial):
             # the scene is the same for all draws, but for a random one, so that no kind of scene is left out for a kind of camera
             base = np.random.default_rng([self.seed, self.scene])
             scene, kinds = draw_base(base, rng, named_scenes([Path(file) for file in self.files]))
-            camera = draw_camera(rng, scene)
+            camera = draw_camera(rng, scene, self.exactly)
             return build_scene(DrawnScene(camera.scene, (*kinds, *camera.kinds)), path, self.place(draw))
 
     def frame_trial(self, built: BuiltScene, number: int) -> CameraFrameTrial:
         """Frame number `number` of a built scene, drawn."""
         rng = np.random.default_rng([self.seed, self.scene, number])
-        frame = draw_frame(rng, built.stage, lambda missed: estimator_of(str(built.path), missed, -1))
+        shares = EXACTLY_KNOWN if self.exactly else KNOWN
+        frame = draw_frame(rng, built.stage, lambda missed: estimator_of(str(built.path), missed, -1), shares)
         return CameraFrameTrial(built, replace(frame, kinds=(*built.drawn.kinds, *frame.kinds)), number)
