@@ -17,13 +17,13 @@ from turned_state import HAIR, Angles, Floats, TurnedState, holds
 from cameras.scenes import LARGEST_RAD
 from runtime import Attitude, Box, Estimator
 from runtime.attitude import Angle, mounted
-from runtime.scene import Calibration
+from runtime.scene import Scene
 from runtime.turned import bins_of, seen_box
 
 KNOWN = {"level": 0.15, "attitude known exactly": 0.65, "attitude to 0.1 degrees": 0.12, "attitude to 0.6 degrees": 0.08}
 """How well the attitude is known, and how often: a plus-minus takes ten times as long as none."""
 EXACTLY_KNOWN = {"level": 0.2, "attitude known exactly": 0.8}
-"""The same of a campaign in which all is told exactly."""
+"""The same of a campaign in which all is told exactly: of a mounted camera the aircraft's pitch too, from which its roll and yaw follow."""
 Shares = dict[str, float]
 PLUS_MINUS_RAD = {"attitude to 0.1 degrees": (1e-5, 0.0017), "attitude to 0.6 degrees": (0.0017, 0.01)}
 """Of roll and of yaw; one of them is known exactly in a third of the frames."""
@@ -88,14 +88,16 @@ class Readings:
     kinds: Kinds
 
     @staticmethod
-    def draw(rng: Rng, stated: bool, calibration: Calibration, shares: Shares) -> Readings:
-        """Of a frame whose camera's roll and yaw no scene states, or one does, of a camera that may be off, known in one of these ways."""
+    def draw(rng: Rng, scene: Scene, shares: Shares) -> Readings:
+        """Of a frame whose camera's roll and yaw the scene states or not, and which may be off, known in one of these ways."""
+        stated, calibration = scene.attitude is not None, scene.calibration
         chosen = {name: share for name, share in shares.items() if name != "level"}
         known = str(rng.choice(list(chosen), p=np.array(list(chosen.values())) / sum(chosen.values())))
         low, high = np.log10(PLUS_MINUS_RAD.get(known, (1.0, 1.0)))
         halves = 10.0 ** rng.uniform(low, high, 3) * (known in PLUS_MINUS_RAD)
         halves[[0, 2]] *= ((1, 1), (0, 1), (1, 0))[rng.integers(3)]
         halves[1] = 10.0 ** rng.uniform(*np.log10(PITCH_PLUS_MINUS_RAD).tolist())
+        halves[1] *= scene.camera.mount is None or shares is not EXACTLY_KNOWN
         off = np.where(rng.random(3) < 0.5, rng.choice([-1.0, 1.0], 3), rng.uniform(-1, 1, 3))
         beside = np.array([calibration.roll_rad, 0.0, calibration.yaw_rad])
         if beside.any():
@@ -136,7 +138,7 @@ class Readings:
 
 def draw_told(rng: Rng, estimator: Estimator, state: TurnedState, level: bool, shares: Shares) -> Told:
     """What is told of a state's camera, enough for `MOST_RUNS`; nothing of its attitude where it is level."""
-    readings = Readings.draw(rng, estimator.scene.attitude is not None, estimator.scene.calibration, shares)
+    readings = Readings.draw(rng, estimator.scene, shares)
     if level:
         prior = replace(readings, kinds=("level",)).told(estimator, state)
         return replace(prior, attitude=None)
