@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -20,10 +21,12 @@ from test_lens import FISHEYE, WIDE
 from runtime import Box, Estimator, Scene
 from runtime.motion import tilted
 from runtime.on_sensor import refined
+from runtime.refine.ends import contract_by_ends
 from runtime.refine.lit_pixels import LitPixels
 from runtime.refine.optics import Optics
 from runtime.refine.refiner import Refiner
 from runtime.refine.sensor_borders import SensorBorders
+from runtime.refine.sight import Sight
 from runtime.refine.slices import covering
 from runtime.scene import Axis, Calibration, Camera, Distortion, Domain, Marking, Runway, SceneError
 from runtime.state_set import StateSet
@@ -117,6 +120,47 @@ def test_a_tilt_may_put_an_end_behind_the_camera() -> None:
             assert any(
                 state.within(*(getattr(left[np.array([number])], side)[0] for side in ("lower", "upper"))) for number in range(len(left))
             )
+
+
+@pytest.mark.parametrize(
+    "calibration", [Calibration(focal_relative=f, principal_px=p) for f, p in ((0.08, 0.33), (0.03, 0.1), (0.01, 0.05))]
+)
+def test_ends_are_kept_where_focal_lengths_are_off_by_more_than_the_centre(calibration: Calibration) -> None:
+    """A set that is thin in all but z, its near end a hair above a border: where that is met moves far, and the tilt's part with it."""
+    camera, y = Camera(640, 480, focal_px=(350.0, 350.0)), 10.0
+    optics, tangent = Optics.of(camera, calibration), (400 - 240) / 350
+    tried = 0
+    for border, column, theta in itertools.product(range(330, 479, 12), (5, 100, 635), (-0.1, 0.0, 0.1, 0.25)):
+        state = RationalState.near(np.array([theta, 0.0, y, 0.0]))
+        view = off_view(replace(PAPER, camera=camera, calibration=calibration), [0, 0, -1, 1, 1])
+        near_m, p_x = ground_of(view, state, column, border)
+        if near_m <= 0:
+            continue
+        start_m = math.nextafter(near_m, math.inf)
+        domain = Domain(*(Axis((float(value),), 0.0) for value in state.floats))
+        scene = Scene(camera, Runway((Marking("m", p_x, start_m, 3 * start_m),)), domain, PAPER.bank, calibration=calibration)
+        frame = off_view(scene, [0, 0, -1, 1, 1]).image(state).frame
+        pitch = float(state.floats[0]) - calibration.principal_px / (350 * (1 - calibration.focal_relative))
+        scale = 350 * (math.cos(pitch) * tangent + math.sin(pitch)) / y
+        if frame[border:].any() or not frame.any() or scale <= 0:
+            continue
+        thin = (np.array([[low, high]]) for low, high in ((0.0, 0.0), (y, y), (-start_m / 5, start_m / 5)))
+        pitches, scales = pitch + 2.0**-45 * np.array([[-1, 1]]), scale * (1 + 1e-12 * np.array([[-1, 1]]))
+        sets = StateSet(pitches, *thin, scales, np.array([tangent]))
+        low, high = contract_by_ends(sets, Sight.of(scene, sets, LitPixels.of(frame, WHOLE, beyond=True), 0, None, optics)).z[0]
+        assert low <= 0 <= high
+        tried += 1
+    assert tried > 50
+
+
+def ground_of(view: RationalView, state: RationalState, column: int, row: int) -> tuple[float, float]:
+    """How far ahead and aside of the aircraft the ground lies that a level camera shows there; 0 where it shows none, or almost none."""
+    right, down = (Fraction(column) - view.u0) / view.focal_u, (Fraction(row) - view.v0) / view.focal_v
+    cosine, sine = (1 - state.tangent**2) / (1 + state.tangent**2), 2 * state.tangent / (1 + state.tangent**2)
+    fall, ahead = cosine * down + sine, cosine - sine * down
+    if fall <= Fraction(1, 50) or ahead <= 0:
+        return 0.0, 0.0
+    return float(ahead * state.y / fall), float(right * state.y / fall)
 
 
 def by_lens(view: RationalView, x: arb, y: arb) -> tuple[arb, arb]:

@@ -7,7 +7,8 @@ the whole stretch of all lines that may hold a marking, a marking meets a border
     |T - T0| <= |D_y(S0, T0) - D_y of the border| / rise
 
 from any T0 of the stretch, S0 being where its line is at T0. That bounds where all states' markings meet the border, whatever T0 is; it is
-narrow for one found by Newton's steps along the line in the middle.
+narrow for one found by Newton's steps along the line in the middle. A principal point's plus-minus shows the marking beside D by a bound that
+is another at another T: by what that grows at most a T, `rise` is less.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ class Curves:
     start: Floats
     stop: Floats
     rise: Floats
-    """A bound below dD_y/dT on the stretches of all lines."""
+    """A bound below dD_y/dT on the stretches of all lines, less what the tilt's bound grows by."""
     monotone: Bits
     """True where that is above 0, and the stretch within the lens's disc; else the others mean nothing."""
     margin: Floats
@@ -68,9 +69,11 @@ class Curves:
         steepest = np.maximum(np.abs(least), np.abs(most))
         reach = ((high - low) / 2 + margin + step[:, None] / 2 * (1 + steepest)) * (1 + ROUNDED_DERIVATIVE)
         _, mixed, down, off = optics.derivatives(s, middle, reach)
-        rise = down + np.minimum(least * mixed, most * mixed) - off * (1 + steepest)
-        fine &= (known & optics.within(s, middle, reach) & (rise > 0)).all(axis=1)
-        return Curves(optics, lines, start, stop, np.where(fine, rise.min(axis=1), 1.0), fine, margin)
+        rise = (down + np.minimum(least * mixed, most * mixed) - off * (1 + steepest)).min(axis=1)
+        farthest = np.maximum(np.abs(low), np.abs(high)).max(axis=1) + reach.max(axis=1), np.maximum(np.abs(start), np.abs(stop))
+        rise = rise - optics.tilt_growth(lines.view.turns, *farthest) * (1 + steepest[:, 0])
+        fine &= (known & optics.within(s, middle, reach)).all(axis=1) & (rise > 0)
+        return Curves(optics, lines, start, stop, np.where(fine, rise, 1.0), fine, margin)
 
     def met(self, border: Floats) -> Met:
         """Where they may meet borders that the lens shows at these D_y, (rows, sets)."""

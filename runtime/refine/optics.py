@@ -183,6 +183,17 @@ class Optics:
         beside_v = np.abs(mixed * right + along * down - 1) + more
         return self.tilt * beside_u, self.tilt * beside_v
 
+    def tilt_growth(self, turns: Turns, s: Floats, t: Floats) -> Floats:
+        """By how much the bounds of `beside_tilt` grow at most a way in rays, no farther than |s| and |t| from the axis.
+
+        L being the square of a ray's length, (right, down) is 2 L long at most and grows by 4 of that length; an entry of J grows by its bend,
+        what is of second order by the growth of 4 L^2.
+        """
+        if self.tilt == 0:
+            return np.zeros(1)
+        length = 1 + s * s + t * t
+        return self.tilt * (4 + 16 * (self.tilt + turns.off)) * length * length * (self.lens.largest_scale + self.lens.largest_bend)
+
     def between(self, first: Floats, last: Floats, row: Floats) -> Stretch:
         """Of the border between two columns, of one shape; `row` is of that shape, or its last axes."""
         left, right = self._place(first, row), self._place(last, row)
