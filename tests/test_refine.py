@@ -34,7 +34,8 @@ from scenes import (
 from runtime.camera import ground_scale
 from runtime.estimator import Estimator
 from runtime.image import dilated, runway_image
-from runtime.refine import LARGEST_START, MOST_TO_JOIN, Refiner, connected_parts, joined
+from runtime.refine.refiner import LARGEST_START, Refiner, joined
+from runtime.refine.regions import MOST_TO_JOIN, connected_parts
 from runtime.refine.theorem_b import LEAST_SEARCH
 from runtime.rounding import inverted
 from runtime.scene import Scene

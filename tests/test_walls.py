@@ -33,9 +33,11 @@ SHARED_WITH_VERIFIER = {
     "build_model.window",
     "runtime",
     "runtime.assumptions",  # words
+    "runtime.attitude",  # imported by what makes a lens's tables, which are proved, with the next ones so marked (*)
     "runtime.domain",  # how a scene is divided into cells, which the verifier derives anew
     "runtime.errors",
     "runtime.ideal",  # which scene the ideal frame has
+    "runtime.lens",  # *
     "runtime.model",
     "runtime.model.format",
     "runtime.model.limits",  # numbers
@@ -49,12 +51,23 @@ SHARED_WITH_VERIFIER = {
     "runtime.model.operators.table",
     "runtime.model.operators.tensor",
     "runtime.model.protobuf",
+    "runtime.outline",  # *
+    "runtime.painting",  # *
+    "runtime.refine",
+    "runtime.refine.interval",  # *
+    "runtime.refine.optics",  # *
+    "runtime.rounding",  # *
     "runtime.scene",
     "runtime.scene_error",
+    "runtime.sensor_map",  # *
+    "runtime.state_set",  # *
     "runtime.terminal",  # what the command prints on
     "runtime.turn",  # the scene's reader takes the tangents of a glide's angles with it; the verifier takes them anew
 }
-"""All that the proof may load of the project beside its own: no mask, bound or rounding of the build, no state network, no refinement."""
+"""All that the proof may load of the project beside its own: no mask, bound or rounding of the build, no state network, no refinement.
+
+Behind a lens the runtime derives tables from the scene, which the proof takes from it and holds against the lens's own formulas.
+"""
 
 
 def modules_below(folder: Path, root: Path) -> list[str]:

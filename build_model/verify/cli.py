@@ -50,6 +50,7 @@ def _table(model: Path, report: proof.VerificationReport) -> Table:
         "pixels of all O, bounds proved": report.may_light_pixels,
         "pixels of all K, each proved": report.must_light_pixels,
         "windows, each proved": report.windows,
+        **({} if report.corners == 0 else _behind_a_lens(report)),
         "smallest margin": f"{report.margin_px:.3g} px",
         "calibration moves the image by": f"{report.displacement_px:.3f} px at most",
         "seconds": f"{report.seconds:.1f}",
@@ -59,6 +60,13 @@ def _table(model: Path, report: proof.VerificationReport) -> Table:
     for name, value in rows.items():
         table.add_row(name, str(value))
     return table
+
+
+def _behind_a_lens(report: proof.VerificationReport) -> dict[str, object]:
+    return {
+        "rays of the sensor's corners, each proved": report.corners,
+        "pixels of the ideal frame, painting proved": report.painted_pixels,
+    }
 
 
 def verify_model_command() -> None:

@@ -8,8 +8,10 @@ What is proved, and by what arithmetic:
     boxes      of states, scales and reference rows are what the refinement takes for granted (`build_model.verify.box_claims`)
     sizes      |K|, its least value, the budgets' defaults and the stated assumptions agree: integers
     masks, boxes and cover of every cell (`build_model.verify.cell_proof`): Arb's balls of 64 bits, from the plain camera equations
-    lens       does not fold within the frame, and NN_F is that of a pinhole with the sensor's focal lengths: Arb's balls. Not proved: the
-               table of its inverse, which the runtime certifies itself (`build_model.verify.lens_proof`)
+    lens       does not fold within the frame, NN_F is that of a pinhole with the sensor's focal lengths, and the rays of the corners of
+               pixels, which the runtime derives from the scene, are theirs (`build_model.verify.lens_proof`): Arb's balls
+    painting   of the sensor's frame covers what that shows, and of what a missed pixel shows c is a bound
+               (`build_model.verify.painting_proof`): Arb's balls
     tolerance  line_px covers what the calibration can move a marking by (`build_model.verify.displacement`): Arb's balls
 
 No mask, bound or rounding of the build is used; shared with it are the scene's reader and the writer of the expected graph.
@@ -37,9 +39,10 @@ from build_model.verify.cell_claim import cell_claims
 from build_model.verify.cell_proof import CellProof, prove_cell
 from build_model.verify.counterexample import Counterexample, Refuted, demand
 from build_model.verify.displacement import displacement_px
-from build_model.verify.lens_proof import check_lens
+from build_model.verify.lens_proof import check_lens, check_rays
 from build_model.verify.model_graph import check_graph, read_tables
 from build_model.verify.outputs import check_outputs
+from build_model.verify.painting_proof import check_painting
 from build_model.verify.window_claim import window_claims
 from build_model.verify.window_proof import prove_windows
 from runtime.assumptions import assumptions
@@ -47,7 +50,10 @@ from runtime.errors import one_line
 from runtime.ideal import ideal_scene
 from runtime.model.format import METADATA_KEY, PADDING_SIZE, ModelError
 from runtime.model.model_file import parse_model
-from runtime.scene import Scene, SceneError
+from runtime.painting import Painting
+from runtime.refine.optics import Optics
+from runtime.scene import Calibration, Camera, Scene, SceneError
+from runtime.sensor_map import SensorMap
 
 Progress = Callable[[int, int], None]
 """Called with cells proved and cells in all."""
@@ -67,6 +73,10 @@ class VerificationReport:
     """Least distance, px, by which a bound on a column keeps from the border that it must not reach."""
     displacement_px: float
     """Bound on what the calibration can move a marking by."""
+    corners: int
+    """Corners of the sensor's pixels whose rays are proved; 0 without a lens."""
+    painted_pixels: int
+    """Pixels of the ideal frame of which is proved that they are painted where the sensor shows the runway in them."""
     seconds: float
     sha256: str
     counterexample: Counterexample | None
@@ -90,10 +100,11 @@ def verify_model(path: str | Path, jobs: int = 1, progress: Progress = _silent) 
     content = _content(Path(path))
     model, metadata, scene = _opened(content, str(path))
     proofs: list[CellProof] = []
-    counterexample, shift_px, cells = None, float("nan"), 0
+    counterexample, shift_px, cells, corners, painted = None, float("nan"), 0, 0, 0
     try:
         cells = len(cell_boxes(scene))
         ideal = _ideal_of(scene, metadata)
+        corners, painted = _check_sensor(scene, ideal.camera, metadata, jobs)
         tables, shift_px = _check_all_but_masks(model, metadata, ideal, assumptions(scene))
         for proof in _cell_proofs(ideal, tables, jobs):
             if isinstance(proof, Counterexample):
@@ -112,6 +123,8 @@ def verify_model(path: str | Path, jobs: int = 1, progress: Progress = _silent) 
         windows=sum(proof.windows for proof in proofs),
         margin_px=min((proof.margin_px for proof in proofs), default=float("nan")),
         displacement_px=shift_px,
+        corners=corners,
+        painted_pixels=painted,
         seconds=time.perf_counter() - start,
         sha256=hashlib.sha256(content).hexdigest(),
         counterexample=counterexample,
@@ -159,6 +172,19 @@ def _ideal_of(scene: Scene, metadata: dict[str, Any]) -> Scene:
         raise Refuted(Counterexample(f"metadata: ideal_camera is unusable ({error})")) from error
     check_lens(scene.camera, scene.calibration, ideal.camera)
     return ideal
+
+
+def _check_sensor(scene: Scene, ideal: Camera, metadata: dict[str, Any], jobs: int) -> tuple[int, int]:
+    """How many corners' rays and ideal pixels are proved, of the tables that the runtime derives behind a lens. Raises `Refuted`."""
+    if scene.camera.pinhole:
+        return 0, 0
+    camera, off, sensor = scene.camera, scene.calibration, SensorMap.of(scene)
+    demand(sensor.ideal == ideal, "metadata: ideal_camera is not the one that the runtime derives from the scene")
+    corners = check_rays(camera, off, sensor.rays, jobs)
+    for part in () if off.exact else Optics.parts_of(scene):
+        s, t, away = (side.reshape(sensor.rays[0].shape) for side in part.corners)
+        corners += check_rays(part.camera, Calibration(), (s, t, away), jobs)
+    return corners, check_painting(scene, ideal, Painting.of(sensor), metadata["ideal_pixels_a_pixel"], sensor.rays, jobs)
 
 
 def _check_all_but_masks(model: onnx.ModelProto, metadata: dict[str, Any], scene: Scene, assumed: list[str]) -> tuple[BankTables, float]:
