@@ -53,8 +53,10 @@ class Attitude:
             object.__setattr__(self, field.name, float(getattr(self, field.name)))
         for name in ("roll", "yaw"):
             angle, plus_minus = getattr(self, f"{name}_rad"), getattr(self, f"{name}_plus_minus_rad")
-            if not (math.isfinite(angle) and plus_minus >= 0 and abs(angle) + plus_minus <= LARGEST_TURN_RAD):
-                expected = f"give a plus-minus of 0 or more, and at most {LARGEST_TURN_RAD} rad with it"
+            if not plus_minus >= 0:
+                raise ValueError(f"attitude: found {name}_plus_minus_rad {plus_minus}; give 0 or more")
+            if not abs(angle) + plus_minus <= LARGEST_TURN_RAD:
+                expected = f"give radians, of at most {LARGEST_TURN_RAD} with the plus-minus"
                 raise ValueError(f"attitude: found {name}_rad {angle} +- {plus_minus}; {expected}")
 
     @staticmethod

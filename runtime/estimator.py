@@ -196,6 +196,8 @@ class Estimator:
 
     def known_attitude(self, told: Attitude | None) -> Attitude | None:
         """Roll and yaw of the camera: as told or by the scene, and what [calibration] has of a plus-minus besides; None if level."""
+        if not isinstance(told, Attitude | None):
+            raise TypeError(f"attitude: found {type(told).__name__}; give an Attitude(roll_rad, yaw_rad)")
         told, off = told or self.attitude, self.scene.calibration
         return None if told is None else told.wider(off.roll_rad, off.yaw_rad)
 

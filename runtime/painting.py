@@ -249,9 +249,11 @@ def ideal_pixels_a_pixel(scene: Scene, sensor: SensorMap, painting: Painting) ->
     """
     rows, columns = (side.ravel() for side in np.mgrid[painting.window])
     used = (painting.table < len(painting.unseen)).any(axis=1) & ~painting.everything
-    if not used.any():
-        return 1
     wide, tall = _extents(sensor, rows[used], columns[used])
+    of_others = _extents_of_unbounded(sensor, painting)
+    wide, tall = np.append(wide, of_others[0]), np.append(tall, of_others[1])
+    if len(wide) == 0:
+        return 1
     flattest, px_per_m = _flattest(scene, sensor), _least_scale(scene, sensor)
     across = np.minimum(wide, flattest * tall)
     a_line = 1 + np.floor(across * (1 + ROUNDING_SHARE)) + 1 + np.floor(tall * (1 + ROUNDING_SHARE)) + 1
@@ -263,6 +265,28 @@ def _extents(sensor: SensorMap, rows: Integers, columns: Integers) -> tuple[Floa
     """Width and height, px of the ideal frame, of what pixels show."""
     u, v = sensor.corners(rows + DOWN, columns + RIGHT)
     wide, tall = ((high.max(axis=0) - low.min(axis=0)) + 2 * (sensor.bow_px + OUTWARD_PX) for low, high in (u, v))
+    return wide, tall
+
+
+def _extents_of_unbounded(sensor: SensorMap, painting: Painting) -> tuple[Floats, Floats]:
+    """The same of the pixels that paint everything, by where the sensor may show the ideal pixels that are not lit always."""
+    height, width = sensor.camera.shape
+    unbounded = np.zeros((height, width), dtype=bool)
+    unbounded[painting.window] = painting.everything.reshape(unbounded[painting.window].shape)
+    first, last = np.full((2, height, width), np.inf), np.full((2, height, width), -np.inf)
+    if unbounded.any():
+        places = np.argwhere(~painting.unseen.reshape(painting.shape))
+        shown = _shown_squares(sensor, places[:, 0], places[:, 1], 1)
+        sides = [
+            (np.maximum(np.ceil(low) - 1, 0), np.minimum(np.floor(high) + 1, size))
+            for (low, high), size in zip(shown, (width, height), strict=True)
+        ]
+        blocks = np.stack([sides[1][0], sides[1][1], sides[0][0], sides[0][1]], axis=-1).astype(np.int64)
+        for place, (top, bottom, left, right) in zip(places, blocks.tolist(), strict=True):
+            block = np.s_[:, top:bottom, left:right]
+            first[block] = np.minimum(first[block], place[:, None, None])
+            last[block] = np.maximum(last[block], place[:, None, None] + 1)
+    tall, wide = (last - first)[:, unbounded & (last[0] > first[0])]
     return wide, tall
 
 

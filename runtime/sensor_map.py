@@ -276,6 +276,7 @@ def _ideal_rays(turn: Turn, s: Floats, t: Floats, off: Floats) -> tuple[tuple[Fl
     tangent = half_b * (1 + half_b**2)
     ahead = nearest > LEAST_DEPTH
     z, nearest = np.where(ahead, z, 1.0), np.where(ahead, nearest, 1.0)
+    aside_off, down_off = np.where(ahead, aside_off, 0.0), np.where(ahead, down_off, 0.0)
     x, y = (aside * cosine_b - sine_b) / z, down / z
     x_off, y_off = aside_off / (z * nearest), (down_off + np.abs(y) * aside_off * abs(sine_b)) / nearest
     x_size, y_size = np.abs(x) + x_off, np.abs(y) + y_off

@@ -136,11 +136,22 @@ def test_the_angles_of_a_turned_state_are_those_of_its_matrix() -> None:
         assert all(abs(float((found[row, column] - expected[row, column]).mid())) < 1e-15 for row in range(3) for column in range(3))
 
 
-@pytest.mark.parametrize("values", [(math.nan, 0.0), (0.0, math.inf), (0.0, 0.0, -0.1), (0.0, 0.0, 0.0, math.nan), (0.7, 0.0, 0.1)])
-def test_an_attitude_that_makes_no_sense_is_refused(values) -> None:
-    with pytest.raises(
-        ValueError, match=rf"^attitude: found \w+_rad .*; give a plus-minus of 0 or more, and at most {LARGEST_TURN_RAD} rad"
-    ):
+TOO_FAR = rf"; give radians, of at most {LARGEST_TURN_RAD} with the plus-minus$"
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ((math.nan, 0.0), "roll_rad nan .*" + TOO_FAR),
+        ((0.0, math.inf), "yaw_rad inf .*" + TOO_FAR),
+        ((0.7, 0.0, 0.1), r"roll_rad 0.7 \+- 0.1" + TOO_FAR),
+        ((0.0, -3.0), "yaw_rad -3.0 .*" + TOO_FAR),
+        ((0.0, 0.0, -0.1), "roll_plus_minus_rad -0.1; give 0 or more$"),
+        ((0.0, 0.0, 0.0, math.nan), "yaw_plus_minus_rad nan; give 0 or more$"),
+    ],
+)
+def test_an_attitude_that_makes_no_sense_is_refused(values: tuple[float, ...], message: str) -> None:
+    with pytest.raises(ValueError, match=f"^attitude: found {message}"):
         Attitude(*values)
 
 

@@ -98,9 +98,9 @@ def test_a_roll_mixes_the_axes(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("rows", "found"),
     [
-        ([[0, 0, 0, 0, 0, -1, 0]], r"a plus-minus below 0; give finite numbers in order of time$"),
-        ([[0] * 7, [0] * 7], r"found 2 lines, times that do not ascend"),
-        ([[0, 0, np.nan, 0, 0, 0, 0]], r"numbers that are not finite"),
+        ([[0, 0, 0, 0, 0, -1, 0]], r"a plus-minus below 0 in row 1 of its numbers; give 0 or more$"),
+        ([[0] * 7, [0] * 7], r"found a time that is not after the line's before in row 2 of its numbers; give them in order$"),
+        ([[0, 0, np.nan, 0, 0, 0, 0]], r"found a number that is not finite in row 1 of its numbers; give finite ones$"),
     ],
 )
 def test_files_that_cannot_be_used_are_refused(tmp_path: Path, rows: list, found: str) -> None:

@@ -669,9 +669,9 @@ def test_tracking_that_cannot_be_done_is_refused(recording, tmp_path, options, m
     [
         ("time_us,roll_rad\n1,2\n", "no column pitch_rad, yaw_rad, roll_plus_minus_rad"),
         (None, "No such file"),
-        ("{header}\n1,0,0,0,0,-1,0\n", "found 1 lines, times that do not ascend, numbers that are not finite, or a plus-minus below 0"),
-        ("{header}\n1,0,0,0,0,0,0\n1,0,0,0,0,0,0\n", "found 2 lines, times that do not ascend"),
-        ("{header}\n", "found 0 lines"),
+        ("{header}\n1,0,0,0,0,-1,0\n", "found a plus-minus below 0 in row 1 of its numbers"),
+        ("{header}\n1,0,0,0,0,0,0\n1,0,0,0,0,0,0\n", "found a time that is not after the line's before in row 2"),
+        ("{header}\n", "found no line"),
     ],
 )
 def test_attitudes_that_cannot_be_used_are_refused(recording, tmp_path, text, found):

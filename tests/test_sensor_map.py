@@ -15,7 +15,7 @@ from scenes import AIRPORT, PAPER, STRIP, examples
 from test_lens import FISHEYE, LENSES, WIDE, PreciseLens
 
 from runtime.camera import project
-from runtime.scene import Calibration, Distortion, Scene, SceneError
+from runtime.scene import Calibration, Camera, Distortion, Scene, SceneError
 from runtime.sensor_map import SensorMap, ideal_camera
 
 Floats = NDArray[np.float64]
@@ -281,3 +281,20 @@ def test_a_sensor_that_shows_no_runway_is_refused() -> None:
 def test_a_turn_that_makes_no_sense_is_refused(turn: Turned) -> None:
     with pytest.raises(ValueError, match=r"turn: found [ab] from"):
         MAPS["paper, wide"].turned(turn)
+
+
+def test_corners_beyond_the_disc_are_not_seen_whatever_the_plus_minus_of_roll_and_yaw() -> None:
+    """A frame that is farther down than any lens is looked at: no number of its corners there is one, nor a warning."""
+    scene = replace(
+        PAPER,
+        camera=Camera(37, 1029, focal_px=(61.7, 59.8), principal_point=(12.6, 447.6), distortion=FISHEYE),
+        calibration=Calibration(roll_rad=0.0006, yaw_rad=0.0005, principal_px=0.5),
+    )
+    sensor = SensorMap.of(scene)
+    rows, columns = np.mgrid[: scene.camera.height + 1, : scene.camera.width + 1]
+    u, v = sensor.corners(rows, columns)
+    seen = np.isfinite(u[1])
+    assert 0 < seen.sum() < seen.size
+    assert (seen == np.isfinite(sensor.rays[2])).all()
+    assert (np.isfinite(v[1]) == seen).all()
+    assert not np.isnan([*u, *v]).any()

@@ -18,7 +18,7 @@ from build_model.verify.lens_proof import UnfoldedDisc, check_rays
 from build_model.verify.painting_proof import check_painting
 from runtime.lens import Lens
 from runtime.refine.optics import Optics
-from runtime.scene import Calibration, Camera, Distortion, Marking, Runway
+from runtime.scene import Axis, Calibration, Camera, Distortion, Domain, Marking, Runway
 from runtime.sensor import Sensor
 
 SMALL = replace(
@@ -131,3 +131,20 @@ def test_the_verifiers_lens_is_the_runtimes(distortion: Distortion) -> None:
         assert stretch is not None
         assert abs(float(bend.mid()) / theirs.largest_bend - 1) < 0.02
         assert abs(float(stretch.mid()) / theirs.stretch - 1) < 0.01
+
+
+def test_a_pixel_that_paints_everything_may_take_much_with_it() -> None:
+    """A fisheye lens of more than 80 degrees, the runway in view up to there: what its last pixels show has no bound but the disc's."""
+    scene = replace(
+        SMALL,
+        camera=Camera(37, 1029, focal_px=(61.7, 59.8), principal_point=(12.6, 447.6), distortion=FISHEYE),
+        calibration=Calibration(roll_rad=0.0006, yaw_rad=0.0005, focal_relative=0.0006, principal_px=0.5),
+        domain=Domain(Axis((0.0,), 0.02), Axis((0.0,), 0.05), Axis((4.0,), 0.1), Axis((0.6,), 0.1)),
+    )
+    sensor = Sensor.of(scene)
+    assert sensor.painting is not None
+    assert sensor.painting.everything.any()
+    assert sensor.pixels_a_pixel > 100
+    assert painted(sensor) > 0
+    with pytest.raises(Refuted, match="ideal_pixels_a_pixel is 20, and no more than"):
+        painted(sensor, count=20)

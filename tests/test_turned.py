@@ -205,6 +205,8 @@ def test_wrong_attitudes_and_empty_frames(paper: Estimator) -> None:
     nothing = np.zeros(PAPER.camera.shape, dtype=bool)
     assert paper.estimate(nothing, attitude=attitude).outcome is Outcome.NO_RUNWAY
     assert paper.estimate(frame, attitude=Attitude(-0.3, 0.2)).outcome is Outcome.NO_RUNWAY
+    with pytest.raises(TypeError, match="attitude: found tuple; give an Attitude"):
+        paper.estimate(frame, attitude=(0.05, -0.05))  # pyright: ignore[reportArgumentType]
     far = paper.domain.replace(theta=(0.72, 0.74))
     assert paper.estimate(frame, attitude=attitude, prior=far).outcome is Outcome.INCONSISTENT
     anything = Box(PAPER.domain.lower - 10, PAPER.domain.upper + 10)

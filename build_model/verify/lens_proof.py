@@ -35,7 +35,7 @@ LARGEST_RADIUS = 6
 SLICES_BEYOND = 8
 """Beyond the slice that fills the frame: what is looked at around its corners."""
 ROWS_AT_ONCE = 64
-PARTS = 1, 4, 32
+PARTS = 1, 8, 64, 512
 """Into so many slices what lies around a corner is cut, one after another, to tell how near its ray is."""
 
 
@@ -63,6 +63,11 @@ class UnfoldedDisc:
             slices.append(each)
             number += 1
         return UnfoldedDisc(lens, tuple(slices), min(filled, len(slices)))
+
+    @property
+    def radius(self) -> float:
+        """That of the disc."""
+        return self.filled / SLICES_PER_UNIT
 
     def bend_up_to(self, radius: float) -> arb | None:
         """A bound above second derivatives on the disc of a radius; None beyond what the frame shows, and a little."""
@@ -98,24 +103,26 @@ def check_rays(camera: Camera, off: Calibration, rays: Rays, jobs: int = 1) -> i
     Raises `Refuted` with the corner of which that is not proved. Of those that are not certainly seen nothing is claimed.
     """
     with ctx.workprec(PRECISION_BITS):
-        UnfoldedDisc.of(camera, off)
+        radius = UnfoldedDisc.of(camera, off).radius
     parcels = range(0, camera.height + 1, ROWS_AT_ONCE)
-    work = (joblib.delayed(_first_far)(camera, off, first, *(side[first : first + ROWS_AT_ONCE] for side in rays)) for first in parcels)
+    work = (
+        joblib.delayed(_first_far)(camera, off, radius, first, *(side[first : first + ROWS_AT_ONCE] for side in rays)) for first in parcels
+    )
     for corner in joblib.Parallel(n_jobs=jobs, return_as="generator")(work):
         if corner is not None:
             raise Refuted(Counterexample("the ray of a corner of pixels is not proved to be near to that of the table", pixel=corner))
     return int(np.isfinite(rays[2]).sum())
 
 
-def _first_far(camera: Camera, off: Calibration, first: int, *rays: NDArray[np.float64]) -> tuple[int, int] | None:
+def _first_far(camera: Camera, off: Calibration, radius: float, first: int, *rays: NDArray[np.float64]) -> tuple[int, int] | None:
     """Row and column of the first corner of some rows whose claim is not proved."""
     with ctx.workprec(PRECISION_BITS):
-        lens, (focal_u, focal_v) = BallLens.of(camera.distortion), focal_lengths(camera)
+        lens, (focal_u, focal_v), farthest = BallLens.of(camera.distortion), focal_lengths(camera), arb(radius)
         across = [_shown_at(column, focal_u, camera.u0, off) for column in range(camera.width + 1)]
         for row, table in enumerate(zip(*(side.tolist() for side in rays), strict=True), start=first):
             down = _shown_at(row, focal_v, camera.v0, off)
             for column, (s, t, away) in enumerate(zip(*table, strict=True)):
-                if math.isfinite(away) and not _is_near(lens, (across[column], down), arb(s), arb(t), arb(away)):
+                if math.isfinite(away) and not _is_near(lens, farthest, (across[column], down), (arb(s), arb(t)), arb(away)):
                     return row, column
     return None
 
@@ -130,12 +137,18 @@ def _shown_at(place: int, focal: arb, centre: float, off: Calibration) -> BallIn
     return functools.reduce(arb.min, sides), functools.reduce(arb.max, sides)
 
 
-def _is_near(lens: BallLens, corner: tuple[BallInterval, BallInterval], s: arb, t: arb, away: arb) -> bool:
-    """True if all rays of the disc that are shown between a corner's least and largest places certainly lie within `away` of (s, t)."""
-    shown, _ = lens.shown(s, t)
+def _is_near(lens: BallLens, farthest: arb, corner: tuple[BallInterval, BallInterval], ray: BallInterval, away: arb) -> bool:
+    """True if all rays no farther than `farthest` from the axis that are shown between a corner's least and largest places certainly lie
+    within `away` of one of them.
+    """
+    shown, _ = lens.shown(*ray)
     right, down = (abs(at - low).max(abs(at - high)).upper() for at, (low, high) in zip(shown, corner, strict=True))
-    radius, miss = (s * s + t * t).sqrt(), (right * right + down * down).sqrt()
-    return any(miss <= lens.stretch_between((radius - away).max(0), radius + away, parts) * away for parts in PARTS)
+    radius, miss = (ray[0] * ray[0] + ray[1] * ray[1]).sqrt(), (right * right + down * down).sqrt()
+    beyond = farthest * (1 + arb(2) ** -40)  # a ray on the disc's border, as float64 has it
+    if not radius <= beyond:
+        return False
+    low, high = (radius - away).max(0).min(farthest), (radius + away).min(beyond)
+    return any(miss <= lens.stretch_between(low, high, parts) * away for parts in PARTS)
 
 
 def _farthest_corner(camera: Camera, off: Calibration) -> arb:

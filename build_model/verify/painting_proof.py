@@ -210,12 +210,12 @@ def _pairs_of(scene: Scene, ideal: Camera, painted_by: PaintedBy, pixels: Intege
         width, height = 1 / (2 * focal_u), 1 / (2 * focal_v)
         for row, column in pixels.tolist():
             x, y = (arb(column) + 0.5 - arb(ideal.u0)) / focal_u, (arb(row) + 0.5 - arb(ideal.v0)) / focal_v
-            claimed, boxes = painted_by.pixels(row, column), [(x, y, width, height, 0)]
+            own, every, boxes = painted_by.pixels(row, column), painted_by.everything, [(x, y, width, height, 0)]
             while boxes:
                 x, y, half_x, half_y, depth = boxes.pop()
                 shown = sensor.shows(x, y, half_x, half_y)
                 by = None if shown is None else [(down, aside) for down in shown[1] for aside in shown[0]]
-                if by is not None and claimed.issuperset(by):
+                if by is not None and all(each in own or each in every for each in by):
                     pairs += [(*each, row, column) for each in by]
                     continue
                 if depth == FINEST:
@@ -249,7 +249,7 @@ class PaintedBy:
         return PaintedBy(rows[pixel[order]], columns[pixel[order]], starts, painting.shape[1], everything)
 
     def pixels(self, row: int, column: int) -> frozenset[Pixel]:
-        """Rows and columns of those that paint one of the ideal frame."""
+        """Rows and columns of those that paint one of the ideal frame, but for those that paint everything."""
         place = row * self.width + column
         own = slice(self.starts[place], self.starts[place + 1])
-        return self.everything.union(zip(self.rows[own].tolist(), self.columns[own].tolist(), strict=True))
+        return frozenset(zip(self.rows[own].tolist(), self.columns[own].tolist(), strict=True))

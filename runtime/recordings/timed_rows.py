@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from runtime.errors import one_line
 
@@ -29,16 +29,22 @@ def timed_rows(path: str | Path, columns: Sequence[str]) -> NDArray[np.float64]:
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or one_line(error)
         raise ValueError(f"{path}: {reason}; give a CSV file with the columns {', '.join(columns)}") from error
-    if len(rows) == 0 or not np.isfinite(rows).all() or (np.diff(rows[:, 0]) <= 0).any():
-        found = f"{len(rows)} lines, times that do not ascend, or numbers that are not finite"
-        raise ValueError(f"{path}: found {found}; give finite numbers in order of time")
+    if len(rows) == 0:
+        raise ValueError(f"{path}: found no line; give finite numbers in order of time")
+    _demand_of_rows(path, np.isfinite(rows).all(axis=1), "a number that is not finite", "give finite ones")
+    _demand_of_rows(path, np.diff(rows[:, 0], prepend=-np.inf) > 0, "a time that is not after the line's before", "give them in order")
     return rows
 
 
 def rows_with_plus_minus(path: str | Path, columns: Sequence[str]) -> NDArray[np.float64]:
     """`timed_rows` of three readings and their three plus-minus. Raises ValueError for a plus-minus below 0, too."""
     rows = timed_rows(path, columns)
-    if (rows[:, 4:] < 0).any():
-        found = f"{len(rows)} lines, times that do not ascend, numbers that are not finite, or a plus-minus below 0"
-        raise ValueError(f"{path}: found {found}; give finite numbers in order of time")
+    _demand_of_rows(path, (rows[:, 4:] >= 0).all(axis=1), "a plus-minus below 0", "give 0 or more")
     return rows
+
+
+def _demand_of_rows(path: str | Path, holds: ArrayLike, found: str, expected: str) -> None:
+    """Raises ValueError with the first row of numbers of which something does not hold."""
+    faults = np.flatnonzero(~np.asarray(holds))
+    if len(faults):
+        raise ValueError(f"{path}: found {found} in row {faults[0] + 1} of its numbers; {expected}")

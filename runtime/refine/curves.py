@@ -7,8 +7,8 @@ the whole stretch of all lines that may hold a marking, a marking meets a border
     |T - T0| <= |D_y(S0, T0) - D_y of the border| / rise
 
 from any T0 of the stretch, S0 being where its line is at T0. That bounds where all states' markings meet the border, whatever T0 is; it is
-narrow for one found by Newton's steps along the line in the middle. A principal point's plus-minus shows the marking beside D by a bound that
-is another at another T: by what that grows at most a T, `rise` is less.
+narrow for one found by Newton's steps along the line in the middle. A principal point's plus-minus shows the marking beside D, by a bound
+that is another at another T: by what that grows at most a T, `rise` is less.
 """
 
 from __future__ import annotations

@@ -186,8 +186,8 @@ class Optics:
     def tilt_growth(self, turns: Turns, s: Floats, t: Floats) -> Floats:
         """By how much the bounds of `beside_tilt` grow at most a way in rays, no farther than |s| and |t| from the axis.
 
-        L being the square of a ray's length, (right, down) is 2 L long at most and grows by 4 of that length; an entry of J grows by its bend,
-        what is of second order by the growth of 4 L^2.
+        L being the square of a ray's length, (right, down) is 2 L long at most and grows by 4 of that length; an entry of J grows by its
+        bend, what is of second order by the growth of 4 L^2.
         """
         if self.tilt == 0:
             return np.zeros(1)
